@@ -1,0 +1,1 @@
+"""The command, the loop, the viewer and the reports."""

@@ -1,0 +1,6 @@
+"""Depth frames from a device, a recording, a folder or a virtual scene."""
+
+from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.source import DepthSource, SourceError, open_source
+
+__all__ = ["Camera", "DepthFrame", "DepthSource", "SourceError", "open_source"]

@@ -1,0 +1,181 @@
+"""The one data type that flows through the app: a depth frame and its camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+DepthArray = npt.NDArray[np.uint16]
+"""Depth image, shape (height, width), millimetres, 0 = no measurement."""
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Pinhole intrinsics of a depth image.
+
+    Parameters
+    ----------
+    width, height : int
+        Size of the image in pixels.
+    fx, fy : float
+        Focal lengths in pixels.
+    cx, cy : float
+        Principal point in pixels; integer coordinates are pixel centres.
+
+    Raises
+    ------
+    ValueError
+        If a size or a focal length is not positive, or a value is not finite.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(
+                f"camera size is {self.width}x{self.height} pixels; both must be at least 1"
+            )
+        if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy))):
+            raise ValueError(f"camera intrinsics must be finite numbers, got {self}")
+        if self.fx <= 0 or self.fy <= 0:
+            raise ValueError(
+                f"focal lengths are {self.fx} and {self.fy} pixels; both must be positive"
+            )
+
+    @classmethod
+    def from_fov(cls, width: int, height: int, fov_x_rad: float, fov_y_rad: float) -> Camera:
+        """Intrinsics from a stream's fields of view, principal point at the image centre.
+
+        Parameters
+        ----------
+        width, height : int
+            Size of the image in pixels.
+        fov_x_rad, fov_y_rad : float
+            Horizontal and vertical field of view in radians, each in (0, pi).
+        """
+        for fov in (fov_x_rad, fov_y_rad):
+            if not 0 < fov < math.pi:
+                raise ValueError(f"field of view is {fov} rad; it must lie between 0 and pi")
+        return cls(
+            width=width,
+            height=height,
+            fx=width / (2 * math.tan(fov_x_rad / 2)),
+            fy=height / (2 * math.tan(fov_y_rad / 2)),
+            cx=width / 2,
+            cy=height / 2,
+        )
+
+    @classmethod
+    def kinect(cls, width: int = 640, height: int = 480) -> Camera:
+        """Nominal intrinsics of a Kinect for Xbox 360, scaled to the image's width.
+
+        585 pixels at 640x480, the calibration published with the 7-Scenes recordings; used
+        where a source says nothing of its camera.
+        """
+        focal = 585.0 * width / 640.0
+        return cls(width, height, focal, focal, width / 2, height / 2)
+
+    def points_mm(
+        self, uv: npt.NDArray[np.generic], depth_mm: npt.NDArray[np.generic]
+    ) -> npt.NDArray[np.float32]:
+        """Metric points of pixels: x right, y down, z forward, in millimetres.
+
+        Parameters
+        ----------
+        uv : array of shape (..., 2)
+            Pixels, column first.
+        depth_mm : array of shape (...)
+            Their depth; 0 = no measurement.
+
+        Returns
+        -------
+        float32 array of shape (..., 3)
+            NaN where there is no depth.
+        """
+        z = np.asarray(depth_mm, dtype=np.float32)
+        z = np.where(z > 0, z, np.float32(np.nan))
+        u = np.asarray(uv[..., 0], dtype=np.float32)
+        v = np.asarray(uv[..., 1], dtype=np.float32)
+        x = (u - np.float32(self.cx)) * (z / np.float32(self.fx))
+        y = (v - np.float32(self.cy)) * (z / np.float32(self.fy))
+        return np.stack((x, y, z), axis=-1)
+
+    def project_uv(self, points_mm: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+        """Pixels (column, row) on which metric points of shape (..., 3) fall."""
+        z = points_mm[..., 2]
+        u = points_mm[..., 0] / z * self.fx + self.cx
+        v = points_mm[..., 1] / z * self.fy + self.cy
+        return np.stack((u, v), axis=-1).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthFrame:
+    """One depth image as a sensor delivered it. Checked here, trusted everywhere else.
+
+    Parameters
+    ----------
+    depth_mm : uint16 array of shape (height, width)
+        Depth along the optical axis in millimetres; 0 = no measurement. Made read-only.
+    index : int
+        Number of the frame in its source, from 0.
+    timestamp_us : int
+        The sensor's clock, microseconds; only differences mean anything.
+    camera : Camera
+        Intrinsics, of the image's size.
+    source : str
+        Where the frame came from, for messages and reports.
+
+    Raises
+    ------
+    ValueError
+        If the array's type or shape is not as stated, saying what was expected.
+    """
+
+    depth_mm: DepthArray
+    index: int
+    timestamp_us: int
+    camera: Camera
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        depth = self.depth_mm
+        if not isinstance(depth, np.ndarray) or depth.dtype != np.uint16 or depth.ndim != 2:
+            got = getattr(depth, "dtype", type(depth).__name__), getattr(depth, "shape", ())
+            raise ValueError(f"depth_mm must be a uint16 array of shape (height, width), got {got}")
+        if depth.shape != (self.camera.height, self.camera.width):
+            raise ValueError(
+                f"depth_mm has shape {depth.shape}, but the camera is {self.camera.height} rows"
+                f" by {self.camera.width} columns"
+            )
+        if not depth.flags.c_contiguous:
+            depth = np.ascontiguousarray(depth)
+            object.__setattr__(self, "depth_mm", depth)
+        depth.flags.writeable = False
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self.camera.height, self.camera.width
+
+    def measure(self, uv: npt.NDArray[np.integer]) -> DepthArray:
+        """The frame as a random-access sensor.
+
+        Parameters
+        ----------
+        uv : int array of shape (n, 2)
+            Pixels to measure, column first.
+
+        Returns
+        -------
+        uint16 array of shape (n,)
+            Depth in millimetres, 0 = no return.
+        """
+        return self.depth_mm[uv[:, 1], uv[:, 0]]

@@ -1,0 +1,56 @@
+"""Two threads for compiled kernels that release the GIL.
+
+Numba's own `prange` is avoided: its default threading layer aborts the process when two
+Python threads enter it at once, and here both selectors and the viewer run side by side.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+
+def default_threads() -> int:
+    """Number of kernel threads: the processors this process may use, or SELECTIVE_DEPTH_THREADS."""
+    asked = os.environ.get("SELECTIVE_DEPTH_THREADS", "")
+    if asked.isdigit() and int(asked) > 0:
+        return int(asked)
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Windows and macOS
+        return os.cpu_count() or 1
+
+
+@cache
+def _pool(process_id: int) -> ThreadPoolExecutor:
+    # Keyed by process: threads do not survive a fork.
+    return ThreadPoolExecutor(max_workers=max(default_threads(), 1), thread_name_prefix="kernel")
+
+
+def in_bands(kernel: Callable[[int, int], object], rows: int, threads: int | None = None) -> None:
+    """Call ``kernel(first_row, end_row)`` over bands of rows, in parallel, and wait for all.
+
+    Parameters
+    ----------
+    kernel : callable
+        Must release the GIL and write only to its own rows.
+    rows : int
+        Number of rows in all.
+    threads : int, optional
+        How many bands; default `default_threads()`. 1 runs in the calling thread.
+    """
+    count = min(threads or default_threads(), rows)
+    if count <= 1:
+        kernel(0, rows)
+        return
+    edges = [rows * band // count for band in range(count + 1)]
+    pool = _pool(os.getpid())
+    waiting = [pool.submit(kernel, edges[band], edges[band + 1]) for band in range(1, count)]
+    try:
+        kernel(edges[0], edges[1])
+    finally:
+        # Even if this band fails, no other may still be writing when we return.
+        for future in waiting:
+            future.result()
