@@ -1,0 +1,63 @@
+# Everything a newcomer types: `make run` and `make test`. The rest is for those who stay.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+QUICK := not slow and not hardware and not browser
+TEST_PACKAGES := libopenni2-0 libopenni2-dev g++ libvulkan1 mesa-vulkan-drivers
+
+.DEFAULT_GOAL := help
+.PHONY: help run test test-slow lint format system-packages recordings pictures wheel clean
+
+help: ## Show this list
+	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; name it with: make PYTHON=python3.12")'
+	@echo "Making the environment in $(VENV) ..."
+	@$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: pyproject.toml | $(BIN)/python
+	@echo "Installing selective-depth and what it needs (a minute or two the first time) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+$(VENV)/.tests-installed: pyproject.toml $(VENV)/.installed
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test,lint]'
+	@touch $@
+
+run: $(VENV)/.installed ## Replay the bundled recording: a viewer, or files where there is no display
+	@.ci/system-packages libopenni2-0 || echo "Going on without: the recording's PNG twin is replayed instead."
+	@$(BIN)/selective-depth replay
+
+test: $(VENV)/.tests-installed ## Run the whole suite (the long forms: make test-slow)
+	@.ci/system-packages $(TEST_PACKAGES) || echo "Going on without: the tests that need them are skipped."
+	@$(BIN)/python -m pytest -m "$(QUICK)"
+
+test-slow: $(VENV)/.tests-installed ## Run the long forms: fuzzing, soak, hundreds of cycles
+	@.ci/system-packages $(TEST_PACKAGES)
+	@$(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/.tests-installed ## Check style, types and the import contract
+	@mkdir -p .typing/selective_depth
+	@for room in app drivers selectors; do ln -sfn ../../$$room .typing/selective_depth/$$room; done
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@PYTHONPATH=.typing $(BIN)/lint-imports --no-cache --no-logo
+
+format: $(VENV)/.tests-installed ## Put the code in its standard form
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+system-packages: ## Install what Debian has to give: OpenNI2, its headers, a software Vulkan
+	@.ci/system-packages $(TEST_PACKAGES)
+
+recordings: $(VENV)/.tests-installed ## Make the recordings in recordings/ again
+	@.ci/system-packages $(TEST_PACKAGES)
+	@$(BIN)/python tests/make_recordings.py
+
+wheel: $(VENV)/.installed ## Build dist/*.whl
+	@$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+
+clean: ## Remove everything that was made
+	rm -rf $(VENV) .typing build dist out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
