@@ -1,0 +1,110 @@
+"""Options after the ``?`` of a source's name, taken one by one and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from selective_depth.drivers.source import SourceNotFoundError
+
+SMALLEST, LARGEST = 16, 4096
+"""Bounds of a frame's width and height in pixels that `Options.size` accepts."""
+
+
+class Options:
+    """The options of one source, ``key=value&key=value``.
+
+    Each taking method names the option, its default and what is allowed; `done` then refuses
+    whatever was given and not taken, so that a misspelt option is never silently ignored.
+
+    Parameters
+    ----------
+    text : str
+        What comes after the ``?``; may be empty.
+    source : str
+        Name of the source, for the messages.
+
+    Raises
+    ------
+    SourceNotFoundError
+        Here and in every method, if the text does not say what can be opened.
+    """
+
+    def __init__(self, text: str, source: str) -> None:
+        self._source = source
+        self._given: dict[str, str] = {}
+        self._known: list[str] = []
+        for part in filter(None, text.split("&")):
+            name, equals, value = part.partition("=")
+            if not equals or not value:
+                raise SourceNotFoundError(
+                    f"option '{part}' of {source} has no value; write name=value, with & between"
+                )
+            if name in self._given:
+                raise SourceNotFoundError(f"option '{name}' of {source} is given twice; keep one")
+            self._given[name] = value
+
+    def _take(self, name: str, allowed: str) -> str | None:
+        self._known.append(f"{name} ({allowed})")
+        return self._given.pop(name, None)
+
+    def _refuse(self, name: str, value: str, allowed: str) -> SourceNotFoundError:
+        return SourceNotFoundError(f"{name}={value} of {self._source}: give {allowed}")
+
+    def choice(self, name: str, default: str, allowed: Sequence[str]) -> str:
+        """One of the words `allowed`."""
+        words = ", ".join(allowed)
+        value = self._take(name, words)
+        if value is None:
+            return default
+        if value not in allowed:
+            raise self._refuse(name, value, f"one of {words}")
+        return value
+
+    def integer(self, name: str, default: int, low: int, high: int) -> int:
+        """A whole number from `low` to `high`."""
+        allowed = f"a whole number from {low} to {high}"
+        value = self._take(name, allowed)
+        if value is None:
+            return default
+        # isdecimal alone admits the digits of every script, which int() reads as well.
+        if not (value.isascii() and value.isdecimal() and len(value) < 20):
+            raise self._refuse(name, value, allowed)
+        if not low <= int(value) <= high:
+            raise self._refuse(name, value, allowed)
+        return int(value)
+
+    def number(self, name: str, default: float, low: float, high: float) -> float:
+        """A number from `low` to `high`."""
+        allowed = f"a number from {low:g} to {high:g}"
+        value = self._take(name, allowed)
+        if value is None:
+            return default
+        try:
+            number = float(value)
+        except ValueError:
+            raise self._refuse(name, value, allowed) from None
+        if not low <= number <= high:  # NaN fails as well
+            raise self._refuse(name, value, allowed)
+        return number
+
+    def size(self, name: str, default: tuple[int, int]) -> tuple[int, int]:
+        """Width and height in pixels, written ``640x480``."""
+        allowed = f"WIDTHxHEIGHT such as 640x480, each from {SMALLEST} to {LARGEST} pixels"
+        value = self._take(name, allowed)
+        if value is None:
+            return default
+        width, _, height = value.partition("x")
+        for side in (width, height):
+            if not (side.isascii() and side.isdecimal() and len(side) < 6):
+                raise self._refuse(name, value, allowed)
+            if not SMALLEST <= int(side) <= LARGEST:
+                raise self._refuse(name, value, allowed)
+        return int(width), int(height)
+
+    def done(self) -> None:
+        """Refuse what is left, naming what there is."""
+        if self._given:
+            unknown = ", ".join(f"'{name}'" for name in sorted(self._given))
+            raise SourceNotFoundError(
+                f"{self._source} has no option {unknown}; it has {', '.join(self._known)}"
+            )
