@@ -35,6 +35,10 @@ class DamagedRecordingError(SourceError):
     """A recording cannot be read, or not beyond a certain frame."""
 
 
+class OutputError(SourceError):
+    """A recording or an export cannot be written (disk full, no permission, already there)."""
+
+
 class SourceEndedError(SourceError):
     """Every frame of a recording has been delivered. The normal end, not a fault."""
 
