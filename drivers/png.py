@@ -17,13 +17,7 @@ HEADER_BYTES: Final = 33  # signature, and the IHDR chunk with its length, name 
 MAX_SIDE: Final = 8192
 MAX_FILE_BYTES: Final = 256 * 1024 * 1024
 
-_COLOUR_TYPES: Final = {
-    0: "grey",
-    2: "colour",
-    3: "palette",
-    4: "grey + alpha",
-    6: "colour + alpha",
-}
+_COLOURS: Final = {0: "grey", 2: "colour", 3: "palette", 4: "grey + alpha", 6: "colour + alpha"}
 _NEXT: Final = "depth frames are 16-bit grey PNG; convert this file or remove it from the folder"
 
 
@@ -108,7 +102,7 @@ def _size_from_header(path: Path, header: bytes) -> tuple[int, int]:
     width, height = (int.from_bytes(header[at : at + 4], "big") for at in (16, 20))
     bits, colour = header[24], header[25]
     if (bits, colour) != (16, 0):
-        kind = _COLOUR_TYPES.get(colour, f"colour type {colour}")
+        kind = _COLOURS.get(colour, f"colour type {colour}")
         raise DamagedRecordingError(f"'{path}' is an {bits}-bit {kind} PNG; {_NEXT}.")
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise DamagedRecordingError(

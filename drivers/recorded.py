@@ -12,8 +12,8 @@ TUM      ``depth.txt``, ``depth/``    5000            by sequence: freiburg1, 2,
 Redwood  ``depth/*.png``              1000            525, 525, 319.5, 239.5
 ======== ============================ =============== =========================================
 
-A sidecar, ``frames.toml`` beside the PNG files, overrides all of it. It names no files, so it
-cannot lead outside the folder.
+A sidecar, ``frames.toml`` in the folder, overrides what the layout means. It names no files, so
+it cannot lead outside the folder.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ _SEVEN_SCENES: Final = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 
 @dataclass(frozen=True)
 class _Layout:
-    """What was found in a folder; `files` and `timestamps_us` go together."""
+    """What was found in a folder, and what its kind of layout means."""
 
     name: str
     files: list[Path]
-    settings: Sidecar = field(default_factory=Sidecar)
+    means: Sidecar = field(default_factory=Sidecar)
 
 
 class RecordedFolder(DepthSource):
@@ -90,21 +90,25 @@ class RecordedFolder(DepthSource):
 
     def __init__(self, path: str | Path) -> None:
         self.uri = str(path)
-        layout = _find_layout(Path(path))
-        settings = layout.settings
+        folder = _root_of(Path(path))
+        layout = _find_layout(folder)
+        sidecar = read_sidecar(folder)
+        settings = sidecar.over(layout.means)
         self.layout = layout.name
         self._files = layout.files
         self.frame_count = len(layout.files)
         self.dropped = 0
-        self.camera = _camera_of(layout)
+        self.camera = _camera_of(layout, sidecar.camera)
         self._timestamps_us = settings.timestamps_us
-        if settings.timestamps_us is not None and len(settings.timestamps_us) != len(layout.files):
+        if self._timestamps_us is not None and len(self._timestamps_us) != self.frame_count:
             raise DamagedRecordingError(
-                f"'{path}' holds {len(layout.files)} frames, but {SIDECAR} lists"
-                f" {len(settings.timestamps_us)} timestamps; correct the list or remove it."
+                f"'{path}' holds {self.frame_count} frames, but {SIDECAR} lists"
+                f" {len(self._timestamps_us)} timestamps; correct the list or remove it."
             )
-        self.fps = settings.fps or _fps_from(settings.timestamps_us)
-        self._to_mm = _millimetre_table(settings.values_per_metre, settings.missing)
+        self.fps = settings.fps or _fps_from(self._timestamps_us)
+        self._to_mm = _millimetre_table(
+            settings.values_per_metre or _MILLIMETRES, settings.missing or ()
+        )
         self._next = 0
         self._ahead: Future[DepthFrame] | None = None
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="png-reader")
@@ -186,9 +190,7 @@ class FolderWriter:
         except OSError as error:
             raise _output_error(self.path, error) from error
         if used:
-            raise OutputError(
-                f"'{self.path}' holds frames already; give a new or an empty folder, or remove them."
-            )
+            raise OutputError(f"'{self.path}' holds frames already; give a new or an empty folder.")
 
     def write(self, frame: DepthFrame) -> None:
         """Add a frame.
@@ -276,27 +278,28 @@ def write_folder(
     return count
 
 
-def _find_layout(path: Path) -> _Layout:
+def _root_of(path: Path) -> Path:
     if not path.is_dir():
         raise SourceNotFoundError(f"the folder '{path}' does not exist; check its name.")
     # The inner folder of a TUM sequence has another scale than its PNG files tell.
     if path.name == "depth" and (path.parent / "depth.txt").is_file():
-        path = path.parent
-    names = _png_names(path)
-    sidecar = read_sidecar(path)
-    if sidecar is not None:
-        layout = _Layout("plain", [path / name for name in names], sidecar)
-    elif (path / "depth.txt").is_file():
-        layout = _tum_layout(path)
+        return path.parent
+    return path
+
+
+def _find_layout(folder: Path) -> _Layout:
+    names = _png_names(folder)
+    if (folder / "depth.txt").is_file():
+        layout = _tum_layout(folder)
     elif scenes := [name for name in names if name.endswith(".depth.png")]:
-        settings = Sidecar(camera=_SEVEN_SCENES, missing=(65535,))
-        layout = _Layout("7-Scenes", [path / name for name in scenes], settings)
-    elif not names and (inner := _png_names(path / "depth")):
-        layout = _redwood_layout(path / "depth", inner)
+        means = Sidecar(camera=_SEVEN_SCENES, missing=(65535,))
+        layout = _Layout("7-Scenes", [folder / name for name in scenes], means)
+    elif not names and (inner := _png_names(folder / "depth")):
+        layout = _redwood_layout(folder / "depth", inner)
     else:
-        layout = _Layout("plain", [path / name for name in names])
+        layout = _Layout("plain", [folder / name for name in names])
     if not layout.files:
-        raise SourceNotFoundError(_nothing_found(path))
+        raise SourceNotFoundError(_nothing_found(folder))
     return layout
 
 
@@ -344,19 +347,19 @@ def _tum_layout(path: Path) -> _Layout:
         timestamps_us.append(timestamp_us)
     known = re.search(r"freiburg([123])", path.resolve().name)
     camera = _TUM_CAMERAS[known[1]] if known else _PRIMESENSE
-    settings = Sidecar(_TUM_SCALE, camera, None, (0,), tuple(timestamps_us))
-    return _Layout("TUM", files, settings)
+    means = Sidecar(_TUM_SCALE, camera, timestamps_us=tuple(timestamps_us))
+    return _Layout("TUM", files, means)
 
 
 def _redwood_layout(folder: Path, names: list[str]) -> _Layout:
     """Redwood's names are ``<frame>-<microseconds>.png`` or plain numbers."""
     stamps = [re.fullmatch(r"[0-9]+-([0-9]{1,15})\.png", name) for name in names]
     timestamps_us = tuple(int(stamp[1]) for stamp in stamps if stamp)
-    settings = Sidecar(
+    means = Sidecar(
         camera=_PRIMESENSE,
         timestamps_us=timestamps_us if len(timestamps_us) == len(names) else None,
     )
-    return _Layout("Redwood", [folder / name for name in names], settings)
+    return _Layout("Redwood", [folder / name for name in names], means)
 
 
 def _nothing_found(path: Path) -> str:
@@ -369,17 +372,13 @@ def _nothing_found(path: Path) -> str:
     return f"{looked}, and for depth.txt. Give a folder that holds them."
 
 
-def _camera_of(layout: _Layout) -> Camera:
-    """The camera of a layout, after checking the header of every file against it."""
-    first_height, first_width = read_png_size(layout.files[0])
-    stated = layout.settings.camera
-    if stated is None:
-        camera = Camera.kinect(first_width, first_height)
-    elif layout.name == "plain" or (stated.width, stated.height) == (first_width, first_height):
-        camera = stated
-    else:
-        # A known layout at an unusual size: its camera was calibrated for 640x480.
-        camera = Camera.kinect(first_width, first_height)
+def _camera_of(layout: _Layout, stated: Camera | None) -> Camera:
+    """The camera of a folder, after checking the header of every file against it."""
+    height, width = read_png_size(layout.files[0])
+    camera = stated or layout.means.camera
+    # A known layout at an unusual size: its camera was calibrated for 640x480.
+    if camera is None or (stated is None and (camera.height, camera.width) != (height, width)):
+        camera = Camera.kinect(width, height)
     for path in layout.files:
         shape = read_png_size(path)
         if shape != (camera.height, camera.width):

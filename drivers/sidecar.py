@@ -21,7 +21,7 @@ Every entry may be left out. TOML is read by the standard library and can only h
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -37,31 +37,36 @@ _CAMERA_KEYS: Final = ("width", "height", "fx", "fy", "cx", "cy")
 
 @dataclass(frozen=True)
 class Sidecar:
-    """Settings of a recorded folder.
+    """Settings of a recorded folder; None where nothing is said.
 
     Parameters
     ----------
-    values_per_metre : float, default 1000
-        PNG value of one metre: 1000 = millimetres, 5000 = the TUM recordings.
+    values_per_metre : float or None
+        PNG value of one metre: 1000 = millimetres (the default), 5000 = the TUM recordings.
     camera : Camera or None
-        Intrinsics; None: known from the layout, or a Kinect's.
+        Intrinsics; default: known from the layout, or a Kinect's.
     fps : float or None
-        Nominal frame rate; None: from the timestamps, or 30.
-    missing : tuple of int, default (0,)
-        PNG values that mean "no measurement"; 0 always does.
+        Nominal frame rate; default: from the timestamps, or 30.
+    missing : tuple of int or None
+        PNG values that mean "no measurement", beside 0 which always does.
     timestamps_us : tuple of int or None
-        One per frame, in the order of the files' names; None: spaced by the frame rate.
+        One per frame, in the order of the files' names; default: spaced by the frame rate.
     """
 
-    values_per_metre: float = 1000.0
+    values_per_metre: float | None = None
     camera: Camera | None = None
     fps: float | None = None
-    missing: tuple[int, ...] = (0,)
+    missing: tuple[int, ...] | None = None
     timestamps_us: tuple[int, ...] | None = None
 
+    def over(self, known: Sidecar) -> Sidecar:
+        """These settings, completed by what else is known."""
+        said = {name: value for name, value in vars(self).items() if value is not None}
+        return replace(known, **said)
 
-def read_sidecar(folder: Path) -> Sidecar | None:
-    """The sidecar of a folder, None if there is none.
+
+def read_sidecar(folder: Path) -> Sidecar:
+    """The sidecar of a folder; nothing said if there is none.
 
     Raises
     ------
@@ -70,7 +75,7 @@ def read_sidecar(folder: Path) -> Sidecar | None:
     """
     path = folder / SIDECAR
     if not path.exists():
-        return None
+        return Sidecar()
     try:
         entries = tomllib.loads(read_text(path))
     except (ValueError, RecursionError) as error:
@@ -82,28 +87,23 @@ def read_sidecar(folder: Path) -> Sidecar | None:
     for name in entries:
         if name not in known:
             raise _wrong(path, name, "no such entry", f"one of {', '.join(known)}")
-    values_per_metre = _number(path, entries, "values_per_metre", 1e-2, 1e6)
-    missing = _integers(path, entries, "missing", 0, 65535)
     return Sidecar(
-        values_per_metre=1000.0 if values_per_metre is None else values_per_metre,
+        values_per_metre=_number(path, entries, "values_per_metre", 1e-2, 1e6),
         camera=_camera(path, entries),
         fps=_number(path, entries, "fps", 1e-3, 1e4),
-        missing=(0,) if missing is None else missing,
+        missing=_integers(path, entries, "missing", 0, 65535),
         timestamps_us=_integers(path, entries, "timestamps_us", -(2**62), 2**62),
     )
 
 
 def write_sidecar(folder: Path, sidecar: Sidecar) -> None:
     """Write ``frames.toml``, whole or not at all."""
-    lines = [
-        "# Depth frames as 16-bit PNG: what the numbers in the files mean.",
-        f"values_per_metre = {sidecar.values_per_metre!r}",
-    ]
-    if sidecar.fps is not None:
-        lines.append(f"fps = {float(sidecar.fps)!r}")
-    lines.append(f"missing = {list(sidecar.missing)}")
-    if sidecar.timestamps_us is not None:
-        lines.append(f"timestamps_us = {list(sidecar.timestamps_us)}")
+    lines = ["# Depth frames as 16-bit PNG: what the numbers in the files mean."]
+    for name, value in vars(sidecar).items():
+        if isinstance(value, tuple):
+            lines.append(f"{name} = {list(value)}")
+        elif isinstance(value, float):
+            lines.append(f"{name} = {value!r}")
     if sidecar.camera is not None:
         lines.append("\n[camera]")
         lines.extend(f"{key} = {getattr(sidecar.camera, key)!r}" for key in _CAMERA_KEYS)
@@ -127,7 +127,8 @@ def read_text(path: Path) -> str:
             data = file.read(_MAX_TEXT_BYTES + 1)
         if len(data) > _MAX_TEXT_BYTES:
             raise DamagedRecordingError(
-                f"'{path}' is larger than {_MAX_TEXT_BYTES // 2**20} MiB; a sidecar is a small text."
+                f"'{path}' is larger than {_MAX_TEXT_BYTES // 2**20} MiB, which no sidecar is;"
+                " remove it."
             )
         return data.decode("utf-8-sig")
     except OSError as error:
