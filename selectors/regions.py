@@ -1,0 +1,202 @@
+"""Regions from neural gas nodes: Delaunay triangles whose edges are short (section III)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from scipy.spatial import Delaunay, QhullError
+
+from selective_depth.selectors.selection import Selection
+
+EdgeMetric = Literal["3d", "image"]
+"""Where the length of an edge is measured: in space (mm) or in the image (pixels)."""
+
+_OUTSIDE, _KEPT, _LONG = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class RegionSelection(Selection):
+    """Neural gas nodes, their triangulation, and the regions read from it.
+
+    Besides `mask`, the triangles that survive (the published rule), and `score`, how dense the
+    nodes are inside it: 1 - longest edge / threshold of the pixel's triangle, 0 elsewhere.
+
+    Parameters
+    ----------
+    nodes_mm : float32 array of shape (N, 3)
+        Nodes in space: x right, y down, z forward, mm.
+    nodes_uv : float32 array of shape (N, 2)
+        Nodes in the image (column, row).
+    triangles : int32 array of shape (T, 3)
+        Delaunay triangulation of `nodes_uv`: indices of nodes.
+    edge_lengths : float32 array of shape (T, 3)
+        Length of each triangle's edges (from corner k to corner k + 1), in `edge_metric`.
+    kept : bool array of shape (T,)
+        Triangles none of whose edges is longer than `threshold`.
+    threshold : float
+        Longest edge kept: `factor` times the mean over all triangles' edges; mm or pixels.
+    edge_metric : str
+        ``"3d"`` or ``"image"``.
+    complement : bool array of shape (height, width)
+        The long-edge complement: pixels of triangles that do not survive. The project's own
+        read-out, not the paper's; with 3-D edges it holds the depth steps.
+    quantisation_error_mm : float
+        Mean distance of the seeds to their nearest node; NaN without seeds.
+    """
+
+    nodes_mm: npt.NDArray[np.float32]
+    nodes_uv: npt.NDArray[np.float32]
+    triangles: npt.NDArray[np.int32]
+    edge_lengths: npt.NDArray[np.float32]
+    kept: npt.NDArray[np.bool_]
+    threshold: float
+    edge_metric: str
+    complement: npt.NDArray[np.bool_]
+    quantisation_error_mm: float
+
+    @cached_property
+    def edges_kept(self) -> npt.NDArray[np.int32]:
+        """Edges not longer than the threshold, each once: indices of nodes, shape (E, 2)."""
+        ends = np.stack((self.triangles, np.roll(self.triangles, -1, axis=1)), axis=-1)
+        short = np.sort(ends[self.edge_lengths <= self.threshold], axis=1)
+        return np.unique(short, axis=0) if len(short) else short
+
+    @cached_property
+    def nodes_kept(self) -> npt.NDArray[np.bool_]:
+        """Nodes that still have an edge, shape (N,): they drive the rescanning (section III)."""
+        kept = np.zeros(len(self.nodes_mm), dtype=np.bool_)
+        kept[self.edges_kept] = True
+        return kept
+
+
+def delaunay_regions(
+    nodes_mm: npt.NDArray[np.float32],
+    nodes_uv: npt.NDArray[np.float32],
+    frame_shape: tuple[int, int],
+    *,
+    edge_metric: EdgeMetric = "3d",
+    factor: float = 1.0,
+    quantisation_error_mm: float = float("nan"),
+) -> RegionSelection:
+    """Triangulate nodes in the image plane and keep the triangles without long edges.
+
+    Parameters
+    ----------
+    nodes_mm : float32 array of shape (N, 3)
+        Nodes in millimetres.
+    nodes_uv : float32 array of shape (N, 2)
+        The same nodes in the image (column, row).
+    frame_shape : tuple of int
+        Height and width of the frame in pixels.
+    edge_metric : {"3d", "image"}, default "3d"
+        Where edges are measured. The paper does not say; masks from image-plane edges are not
+        reproducible (two trainings agree to an IoU of 0.35 against 0.93).
+    factor : float, default 1.0
+        The threshold as a multiple of the mean edge; 1 is the paper's.
+    quantisation_error_mm : float, optional
+        Handed on into the selection.
+
+    Returns
+    -------
+    RegionSelection
+        Empty (no triangle, no pixel) for fewer than three nodes or nodes on one line.
+
+    Raises
+    ------
+    ValueError
+        If `edge_metric` or `factor` is not allowed.
+    """
+    if edge_metric not in ("3d", "image"):
+        raise ValueError(f"edge_metric is {edge_metric!r}; give '3d' or 'image'")
+    if not factor > 0:
+        raise ValueError(f"factor is {factor}; the threshold must be positive, 1 is the mean edge")
+    triangles = triangulate(nodes_uv)
+    corners = (nodes_mm if edge_metric == "3d" else nodes_uv)[triangles]
+    edge_lengths = np.sqrt(np.square(corners - np.roll(corners, -1, axis=1)).sum(axis=2))
+    threshold = factor * float(edge_lengths.mean()) if len(triangles) else 0.0
+    longest = edge_lengths.max(axis=1) if len(triangles) else np.zeros(0, np.float32)
+    kept = longest <= threshold
+    score = np.zeros(frame_shape, dtype=np.float32)
+    state = np.zeros(frame_shape, dtype=np.uint8)
+    worth = np.where(kept, 1 - longest / max(threshold, 1e-30), 0).astype(np.float32)
+    _rasterise(
+        nodes_uv[triangles], np.where(kept, _KEPT, _LONG).astype(np.uint8), worth, state, score
+    )
+    return RegionSelection(
+        mask=state == _KEPT,
+        score=score,
+        name="neural gas",
+        nodes_mm=nodes_mm,
+        nodes_uv=nodes_uv,
+        triangles=triangles,
+        edge_lengths=edge_lengths,
+        kept=kept,
+        threshold=threshold,
+        edge_metric=edge_metric,
+        complement=state == _LONG,
+        quantisation_error_mm=quantisation_error_mm,
+    )
+
+
+def triangulate(uv: npt.NDArray[np.float32]) -> npt.NDArray[np.int32]:
+    """Delaunay triangulation of points of the image plane.
+
+    Parameters
+    ----------
+    uv : float32 array of shape (N, 2)
+        Points in pixels.
+
+    Returns
+    -------
+    int32 array of shape (T, 3)
+        Indices of points; (0, 3) where all points lie on one line.
+    """
+    nothing = np.zeros((0, 3), dtype=np.int32)
+    if len(uv) < 3:
+        return nothing
+    try:
+        return np.ascontiguousarray(Delaunay(uv).simplices, dtype=np.int32)
+    except QhullError:  # Qhull's name for points on one line
+        return nothing
+
+
+@njit(cache=True, nogil=True)
+def _crossing(ax, ay, bx, by, y):  # type: ignore[no-untyped-def]
+    """Where the edge meets a row; the same bits from both of its triangles."""
+    if ay > by or (ay == by and ax > bx):
+        ax, ay, bx, by = bx, by, ax, ay
+    return ax + (y - ay) * ((bx - ax) / (by - ay))
+
+
+@njit(cache=True, nogil=True)
+def _rasterise(corners, states, worths, state, score):  # type: ignore[no-untyped-def]
+    """Paint each pixel whose centre lies in a triangle; a pixel on an edge is painted once."""
+    height, width = state.shape
+    for t in range(len(corners)):
+        a, b, c = corners[t, 0], corners[t, 1], corners[t, 2]
+        # Corners from top to bottom: a row then crosses the long edge and one of the others.
+        if b[1] < a[1]:
+            a, b = b, a
+        if c[1] < b[1]:
+            b, c = c, b
+            if b[1] < a[1]:
+                a, b = b, a
+        first = max(int(np.ceil(a[1])), 0)
+        end = min(int(np.ceil(c[1])), height)
+        for row in range(first, end):
+            y = float(row)
+            one = _crossing(float(a[0]), float(a[1]), float(c[0]), float(c[1]), y)
+            if y < b[1]:
+                other = _crossing(float(a[0]), float(a[1]), float(b[0]), float(b[1]), y)
+            else:
+                other = _crossing(float(b[0]), float(b[1]), float(c[0]), float(c[1]), y)
+            left = max(int(np.ceil(min(one, other))), 0)
+            right = min(int(np.ceil(max(one, other))), width)
+            for column in range(left, right):
+                state[row, column] = states[t]
+                score[row, column] = worths[t]
