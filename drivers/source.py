@@ -23,8 +23,12 @@ class RuntimeMissingError(SourceError):
     """The OpenNI2 runtime is not installed or cannot be loaded."""
 
 
+class DeviceRefusedError(SourceError):
+    """The device is there but does not serve: busy, no permission, wrong mode, no start."""
+
+
 class DeviceLostError(SourceError):
-    """The device was there and is not any more (unplugged, crashed, taken by another process)."""
+    """The device was there and is not any more; a live source goes on looking for it."""
 
 
 class SourceTimeoutError(SourceError):
@@ -62,6 +66,9 @@ class DepthSource(ABC):
         True if frames that are not read in time are lost, as with a device.
     dropped : int
         Frames that the sensor made and nobody read, so far.
+    state : str
+        ``"live"``; a sensor that can fail also says ``"stalled"`` (there, but silent),
+        ``"lost"`` (not there) or ``"reconnecting"`` (there again, being opened).
     """
 
     uri: str
@@ -70,6 +77,7 @@ class DepthSource(ABC):
     frame_count: int | None
     live: bool
     dropped: int
+    state: str = "live"
 
     @abstractmethod
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
