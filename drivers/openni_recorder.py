@@ -1,0 +1,166 @@
+"""Recording a live sensor to an `.oni` file, and making sure that it is all there."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from selective_depth.drivers.openni_device import DeviceSettings
+from selective_depth.drivers.openni_process import Worker, error_of
+from selective_depth.drivers.openni_replay import OpenNIRecording
+from selective_depth.drivers.source import DeviceRefusedError, SourceError, SourceNotFoundError
+
+_OPEN_S = 10.0
+_STALL_S = 5.0  # silence of the sensor after which a recording is ended
+_HANG_S = 5.0  # silence of the worker, which reports five times a second
+_SAVE_S = 10.0  # for the recorder to write what it still holds
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingReport:
+    """What became of a recording.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    frames : int
+        Frames in it, counted by opening it again.
+    seconds : float
+        How long was recorded.
+    ended : str
+        ``"done"``, ``"interrupted"`` or, in words, what ended it early.
+    problem : str
+        What is wrong with the file, and what to do; empty if it is all there.
+    """
+
+    path: Path
+    frames: int
+    seconds: float
+    ended: str
+    problem: str
+
+
+def record(
+    out_path: str | Path,
+    device_uri: str = "",
+    *,
+    frames: int | None = None,
+    duration_s: float | None = None,
+    settings: DeviceSettings | None = None,
+    progress: Callable[[int], None] | None = None,
+    overwrite: bool = False,
+) -> RecordingReport:
+    """Record a live sensor until there are enough frames, or Ctrl-C.
+
+    Ctrl-C ends the recording properly: the report says ``"interrupted"``, and it is for the
+    caller to end with the exit code that this means. A full disk, a file that does not grow, a
+    sensor that stalls or goes end it as well, with what is there so far.
+
+    Parameters
+    ----------
+    out_path : str or Path
+        The file to make, ending in ``.oni``.
+    device_uri : str, default ""
+        Which sensor; empty for the only one.
+    frames : int, optional
+        How many frames to record; default until stopped.
+    duration_s : float, optional
+        How long to record; default until stopped.
+    settings : DeviceSettings, optional
+        How to set the sensor up. Its `mirror` does not matter: recordings are as seen.
+    progress : callable, optional
+        Called with the number of frames so far, some times a second.
+    overwrite : bool, default False
+        Whether a recording of that name may be replaced.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If there is no sensor, or nothing can be written to that place.
+    RuntimeMissingError, DeviceRefusedError
+        As for `OpenNIDevice`.
+    """
+    path = Path(out_path)
+    file = _create(path, overwrite)
+    started = time.monotonic()
+    try:
+        worker = Worker(
+            "record",
+            keep_open=(file,),
+            uri=device_uri,
+            like=None,
+            settings=asdict(settings or DeviceSettings()),
+            file=file,
+            frames=frames,
+            duration_s=duration_s,
+            stall_s=_STALL_S,
+        )
+        try:
+            ended = _follow(worker, progress)
+        finally:
+            worker.close(grace_s=1.0)
+    except BaseException:
+        if os.fstat(file).st_size == 0:
+            path.unlink()
+        raise
+    finally:
+        os.close(file)
+    seconds = time.monotonic() - started
+    counted, problem = _verify(path)
+    return RecordingReport(path, counted, seconds, ended, problem)
+
+
+def _create(path: Path, overwrite: bool) -> int:
+    if path.suffix.lower() != ".oni":
+        raise SourceNotFoundError(f"'{path}' must end in .oni to be a recording.")
+    if not overwrite and path.exists() and path.stat().st_size > 0:
+        raise SourceNotFoundError(f"'{path}' exists already. Give another name, or --overwrite.")
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
+    except OSError as error:
+        raise SourceNotFoundError(
+            f"'{path}' cannot be written: {error.strerror}. Give a place that can."
+        ) from error
+
+
+def _follow(worker: Worker, progress: Callable[[int], None] | None) -> str:
+    """Wait until the file is saved; say what ended it."""
+    interrupted = False
+    patience_s = _OPEN_S
+    while True:
+        try:
+            message = worker.receive(patience_s)
+            if message is None:
+                raise DeviceRefusedError(f"OpenNI2 hangs for {patience_s:g} s while recording.")
+            if message["kind"] == "error":
+                raise error_of(message)
+            if message["kind"] == "died":
+                return str(message["reason"])
+            if message["kind"] == "saved":
+                return "interrupted" if interrupted else str(message["ended"])
+            if message["kind"] in ("opened", "recorded"):
+                patience_s = _SAVE_S if interrupted else _HANG_S
+            if message["kind"] == "recorded" and progress is not None:
+                progress(message["frames"])
+        except KeyboardInterrupt:
+            if interrupted:
+                raise
+            interrupted = True
+            patience_s = _SAVE_S
+            worker.stop()
+
+
+def _verify(path: Path) -> tuple[int, str]:
+    """Open a recording again and count its frames."""
+    frames = 0
+    try:
+        with OpenNIRecording(path) as recording:
+            for _ in recording:
+                frames += 1
+    except SourceError as error:
+        return frames, str(error)
+    return frames, ""

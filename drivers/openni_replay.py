@@ -1,0 +1,147 @@
+"""Replay of an `.oni` recording through OpenNI2: every frame, exactly once."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TypeVar
+
+from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.openni_process import Message, Worker, error_of
+from selective_depth.drivers.source import (
+    DamagedRecordingError,
+    DepthSource,
+    SourceEndedError,
+    SourceNotFoundError,
+    SourceTimeoutError,
+)
+
+_OPEN_S = 10.0  # opening takes milliseconds; beyond this it hangs
+_SILENT_S = 8.0  # the worker itself gives up on a silent file after 5 s
+
+_Over = TypeVar("_Over", SourceEndedError, DamagedRecordingError)
+
+
+class OpenNIRecording(DepthSource):
+    """An `.oni` file, replayed frame by frame, however slow the reader.
+
+    Depth, number and the differences of the timestamps are those of the recording; the camera
+    comes from the recorded stream's field of view.
+
+    Parameters
+    ----------
+    path : str or Path
+        The recording; any path that the system can open.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If there is no such file, or it may not be read.
+    DamagedRecordingError
+        If it is no recording, or damaged.
+    RuntimeMissingError
+        If OpenNI2 is not installed.
+    """
+
+    live = False
+    dropped = 0
+
+    def __init__(self, path: str | Path) -> None:
+        self.uri = str(path)
+        _check_file(Path(path))
+        self._worker: Worker | None = Worker("recording", path=self.uri)
+        self._read_count = 0
+        self._ended: SourceEndedError | DamagedRecordingError | None = None
+        try:
+            about = self._receive(_OPEN_S)
+            if about is None:
+                raise DamagedRecordingError(f"'{self.uri}' cannot be opened: OpenNI2 hangs on it.")
+            self.camera = Camera.from_fov(
+                about["width"], about["height"], about["fov_x_rad"], about["fov_y_rad"]
+            )
+        except BaseException:
+            self.close()
+            raise
+        self.fps = float(about["fps"])
+        self.frame_count = int(about["frames"])
+        self._heard = time.monotonic()
+
+    def read(self, timeout_s: float = 5.0) -> DepthFrame:
+        """Return the next frame of the recording.
+
+        Parameters
+        ----------
+        timeout_s : float, default 5.0
+            How long to wait for it at most.
+
+        Raises
+        ------
+        SourceEndedError
+            After the last frame, and ever after.
+        DamagedRecordingError
+            If the recording cannot be read beyond this point; frames already delivered are good.
+        SourceTimeoutError
+            If the frame did not come in time; the next call goes on waiting for it.
+        """
+        if self._ended is not None:
+            raise self._ended
+        if self._worker is None:
+            raise SourceEndedError(f"'{self.uri}' has been closed.")
+        message = self._receive(timeout_s)
+        if message is None:
+            if time.monotonic() - self._heard < _SILENT_S:
+                raise SourceTimeoutError(
+                    f"'{self.uri}' gave no frame {self._read_count + 1} within {timeout_s:g} s."
+                )
+            raise self._over(
+                DamagedRecordingError(
+                    f"'{self.uri}' cannot be read beyond frame {self._read_count} of"
+                    f" {self.frame_count}: OpenNI2 hangs on it."
+                )
+            )
+        self._heard = time.monotonic()
+        if message["kind"] == "end":
+            raise self._over(
+                SourceEndedError(f"'{self.uri}' has ended after {self._read_count} frames.")
+            )
+        frame = DepthFrame(
+            depth_mm=self._worker.take(message, self.camera.width, self.camera.height),
+            index=message["index"],
+            timestamp_us=message["timestamp_us"],
+            camera=self.camera,
+            source=self.uri,
+        )
+        self._read_count += 1
+        return frame
+
+    def close(self) -> None:
+        """Release the recording. Harmless when called twice."""
+        if self._worker is not None:
+            self._worker.close()
+            self._worker = None
+
+    def _receive(self, timeout_s: float) -> Message | None:
+        assert self._worker is not None
+        message = self._worker.receive(timeout_s)
+        if message is not None and message["kind"] == "error":
+            error = error_of(message)
+            raise self._over(error) if isinstance(error, DamagedRecordingError) else error
+        if message is not None and message["kind"] == "died":
+            raise self._over(
+                DamagedRecordingError(
+                    f"'{self.uri}' cannot be read beyond frame {self._read_count}:"
+                    f" {message['reason']}. `selective-depth check` says what can be saved."
+                )
+            )
+        return message
+
+    def _over(self, error: _Over) -> _Over:
+        self._ended = error
+        self.close()
+        return error
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what OpenNI2 would answer with a crash."""
+    if not path.exists():
+        raise SourceNotFoundError(f"'{path}' does not exist.")

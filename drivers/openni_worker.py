@@ -1,0 +1,578 @@
+"""The process that owns OpenNI2: native code that may crash or hang does it here, alone.
+
+Started by `openni_process.Worker` as a script, so that it needs neither NumPy nor the package
+and is up in a fraction of the time. It is told what to do by one JSON line on standard input,
+then by short commands; it answers in JSON lines on what was its standard output. Depth images
+go through shared memory. When its parent goes, whichever way, its standard input ends and so
+does it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import mmap
+import os
+import queue
+import signal
+import stat
+import sys
+import threading
+import time
+from typing import Any
+
+from primesense import _openni2 as c_api
+from primesense import openni2
+from primesense.utils import InitializationError, OpenNIError
+
+WAIT_S = 0.2  # longest uninterrupted wait for a frame, and the beat of "idle" messages
+SILENT_FILE_S = 5.0  # a file in lock-step delivers within milliseconds; beyond this it is stuck
+SETTLE_S = 0.05  # between stop and close: the runtime's threads set their flags late
+RECORDER_START_S = 5.0  # for the recorder's own thread to write the file's beginning
+DATA_BEGIN = b"NIR\0\x08\0\0\0"  # the record after which it takes frames
+DISK_RESERVE_BYTES = 16 << 20  # stop recording while there is still room for the file's end
+NO_GROWTH_S = 1.5  # a frame takes some 100 kB: a file that stops growing is not being written
+
+
+class JobError(Exception):
+    """Ends the job; `kind` is the name of the error that the parent raises."""
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+class Device(openni2.Device):  # type: ignore[misc]
+    """A device that survives its own failed opening.
+
+    The library's `__del__` closes a half-built device, which crashes the next opening.
+    """
+
+    def _close(self) -> None:
+        if getattr(self, "_devinfo", None) is not None:
+            super()._close()
+
+
+class Parent:
+    """Both ends of the conversation with the process that started this one."""
+
+    def __init__(self) -> None:
+        # Drivers print on standard output: the answers move to a descriptor of their own.
+        self._out = os.dup(1)
+        os.dup2(2, 1)
+        self._commands = open(0, "rb", closefd=False)  # noqa: SIM115 - for all its life
+        self.free_slots: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self.stop = threading.Event()
+
+    def first_job(self) -> dict[str, Any]:
+        """What to do; from now on the pipe is listened to."""
+        line = self._commands.readline()
+        if not line:
+            os._exit(0)
+        job: dict[str, Any] = json.loads(line)
+        threading.Thread(target=self._listen, daemon=True).start()
+        return job
+
+    def send(self, kind: str, **values: object) -> None:
+        """Say one thing."""
+        line = memoryview(json.dumps({"kind": kind, **values}).encode() + b"\n")
+        while line:
+            line = line[os.write(self._out, line) :]
+
+    def _listen(self) -> None:
+        for line in self._commands:
+            word, _, number = line.decode().strip().partition(" ")
+            if word == "free":
+                self.free_slots.put(int(number))
+            else:
+                self.stop.set()
+        # The pipe is closed: asked to go, or the parent is no more. A recording gets the time
+        # to end its file; nothing may outlive this, not even a hanging driver.
+        self.stop.set()
+        time.sleep(3)
+        os._exit(1)
+
+
+class Slots:
+    """The shared memory: equal slots, each free or holding one depth image."""
+
+    def __init__(self, job: dict[str, Any], parent: Parent) -> None:
+        size = job["slots"] * job["slot_bytes"]
+        if sys.platform == "win32":
+            memory = mmap.mmap(-1, size, tagname=job["memory"])
+        else:
+            memory = mmap.mmap(job["memory"], size)
+        self._start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+        self._memory = memory
+        self._slot_bytes: int = job["slot_bytes"]
+        self._parent = parent
+        for slot in range(job["slots"]):
+            parent.free_slots.put(slot)
+
+    def take(self, wait: bool) -> int | None:
+        """A free slot; None if there is none (or, when waiting, if it is time to stop)."""
+        while not self._parent.stop.is_set():
+            try:
+                return self._parent.free_slots.get(timeout=WAIT_S if wait else 0)
+            except queue.Empty:
+                if not wait:
+                    return None
+        return None
+
+    def fill(self, slot: int, address: int, size: int) -> None:
+        """Copy an image from the runtime's memory, which it will use again."""
+        ctypes.memmove(self._start + slot * self._slot_bytes, address, size)
+
+    def fits(self, size: int) -> bool:
+        """Whether an image of so many bytes has room."""
+        return size <= self._slot_bytes
+
+
+def initialize(job: dict[str, Any]) -> None:
+    """Load the runtime, once in a process's life."""
+    folder, openni2._dll_name = os.path.split(job["library"])
+    try:
+        openni2.initialize(folder)
+    except (InitializationError, OpenNIError, OSError) as error:
+        raise JobError(
+            "RuntimeMissingError",
+            f"The OpenNI2 runtime {job['library']} cannot be started: {reason(error)}."
+            " Install it again, or set OPENNI2_REDIST to another one's folder.",
+        ) from error
+
+
+def reason(error: Exception) -> str:
+    """What the runtime says about a failure, in one line."""
+    text = error.args[1] if isinstance(error, OpenNIError) else str(error)
+    if isinstance(text, bytes):
+        text = text.decode(errors="replace")
+    words = " ".join(str(text).split())
+    if words:
+        return words.rstrip(".")
+    code = getattr(error, "code", None)
+    return f"OpenNI2 gives no reason (status {int(code) if code is not None else '?'})"
+
+
+def devices() -> list[dict[str, Any]]:
+    """What the runtime's drivers have found."""
+    infos = ctypes.POINTER(c_api.OniDeviceInfo)()
+    count = ctypes.c_int()
+    c_api.oniGetDeviceList(ctypes.byref(infos), ctypes.byref(count))
+    found = [
+        {
+            "uri": infos[number].uri.decode(errors="replace"),
+            "vendor": infos[number].vendor.decode(errors="replace"),
+            "name": infos[number].name.decode(errors="replace"),
+            "usb_vendor_id": infos[number].usbVendorId,
+            "usb_product_id": infos[number].usbProductId,
+        }
+        for number in range(count.value)
+    ]
+    c_api.oniReleaseDeviceList(infos)
+    return found
+
+
+def choose(found: list[dict[str, Any]], wanted: str, like: list[str] | None) -> dict[str, Any]:
+    """The device to open: the one named, the only one, or one like the one that was lost."""
+    named = [device for device in found if device["uri"] == wanted]
+    if named:
+        return named[0]
+    if like is not None:
+        # Plugged in again, a USB sensor comes back under another address.
+        found = [device for device in found if [device["vendor"], device["name"]] == like]
+        wanted = ""
+    uris = ", ".join(device["uri"] for device in found) or "none"
+    if wanted:
+        raise JobError(
+            "SourceNotFoundError",
+            f"There is no sensor '{wanted}'. Connected: {uris}.",
+        )
+    if not found:
+        raise JobError("SourceNotFoundError", "No depth sensor is connected.")
+    if len(found) > 1:
+        raise JobError(
+            "SourceNotFoundError",
+            f"{len(found)} sensors are connected: {uris}. Name the one to use, for example"
+            f" openni:{found[0]['uri']}.",
+        )
+    return found[0]
+
+
+def mode_text(mode: Any) -> str:
+    """A video mode for people; the library's own `repr` raises."""
+    unit = {100: "mm", 101: "0.1 mm"}.get(int(mode.pixelFormat), f"format {mode.pixelFormat.value}")
+    return f"{mode.resolutionX}x{mode.resolutionY} at {mode.fps} fps in {unit}"
+
+
+class Watch(openni2.DeviceListener):  # type: ignore[misc]
+    """Sets `lost` when the device goes; nothing else in OpenNI2 tells."""
+
+    def __init__(self, uri: str) -> None:
+        super().__init__()
+        self._uri = uri.encode()
+        self.lost = threading.Event()
+
+    def on_disconnected(self, info: Any) -> None:
+        """Called by the runtime, on a thread of its own."""
+        if info.uri == self._uri:
+            self.lost.set()
+
+
+class LiveStream:
+    """A live device's depth stream, with every setting applied and checked."""
+
+    def __init__(self, job: dict[str, Any], parent: Parent) -> None:
+        self.info = choose(devices(), job["uri"], job["like"])
+        parent.send("found", **self.info)
+        uri = self.info["uri"]
+        self.watch = Watch(uri)
+        try:
+            self.device = Device(uri.encode())
+        except OpenNIError as error:
+            raise JobError(
+                "DeviceRefusedError",
+                f"The sensor {uri} is there but cannot be opened: {reason(error)}. Another program"
+                " may hold it (close that program), or you may not use it (install the udev"
+                " rules of libopenni2-0, then plug it in again).",
+            ) from error
+        if not self.device.has_sensor(openni2.SENSOR_DEPTH):
+            raise JobError("DeviceRefusedError", f"The sensor {uri} has no depth camera.")
+        try:
+            self.stream = self.device.create_depth_stream()
+            self._configure(job["settings"])
+        except OpenNIError as error:
+            raise JobError(
+                "DeviceRefusedError",
+                f"The sensor {uri} refuses a depth stream: {reason(error)}. Pull it out and plug"
+                " it in again.",
+            ) from error
+
+    def _configure(self, settings: dict[str, Any]) -> None:
+        stream = self.stream
+        size = settings["width"], settings["height"]
+        modes = self.device.get_sensor_info(openni2.SENSOR_DEPTH).videoModes
+        wanted = [
+            mode
+            for mode in modes
+            if (mode.resolutionX, mode.resolutionY, mode.fps) == (*size, settings["fps"])
+            and int(mode.pixelFormat) == int(openni2.PIXEL_FORMAT_DEPTH_1_MM)
+        ]
+        if not wanted:
+            raise JobError(
+                "DeviceRefusedError",
+                f"The sensor {self.info['uri']} cannot give {size[0]}x{size[1]} at"
+                f" {settings['fps']} fps in mm. It offers: {'; '.join(map(mode_text, modes))}.",
+            )
+        if stream.is_property_supported(c_api.ONI_STREAM_PROPERTY_CROPPING):
+            stream.reset_cropping()
+        stream.set_video_mode(wanted[0])
+        if stream.is_property_supported(c_api.ONI_STREAM_PROPERTY_MIRRORING):
+            # Mirroring, where wanted, is the parent's: libfreenect's writes out of bounds.
+            stream.set_mirroring_enabled(False)
+        registration = (
+            openni2.IMAGE_REGISTRATION_DEPTH_TO_COLOR
+            if settings["registration"]
+            else openni2.IMAGE_REGISTRATION_OFF
+        )
+        if self.device.is_image_registration_mode_supported(registration):
+            if self.device.is_property_supported(c_api.ONI_DEVICE_PROPERTY_IMAGE_REGISTRATION):
+                self.device.set_image_registration_mode(registration)
+        elif settings["registration"]:
+            raise JobError(
+                "DeviceRefusedError",
+                f"The sensor {self.info['uri']} cannot register depth to its colour camera.",
+            )
+
+    def start(self) -> None:
+        """Let the frames come."""
+        try:
+            self.stream.start()
+        except OpenNIError as error:
+            raise JobError(
+                "DeviceRefusedError",
+                f"The sensor {self.info['uri']} does not start: {reason(error)}. Check its power"
+                " supply, pull it out and plug it in again.",
+            ) from error
+
+    def close(self) -> None:
+        """Release the sensor, in the one order that does not crash."""
+        self.stream.stop()
+        time.sleep(SETTLE_S)
+        self.stream.close()
+        self.device.close()
+        openni2.unload()
+
+
+def describe(stream: Any) -> dict[str, Any]:
+    """What the parent needs to know of a depth stream."""
+    mode = stream.get_video_mode()
+    return {
+        "width": mode.resolutionX,
+        "height": mode.resolutionY,
+        "fps": mode.fps,
+        "fov_x_rad": stream.get_horizontal_fov(),
+        "fov_y_rad": stream.get_vertical_fov(),
+    }
+
+
+def next_frame(stream: Any) -> Any | None:
+    """The next frame, to be closed by the caller; None if none comes for a while."""
+    if openni2.wait_for_any_stream([stream], WAIT_S) is None:
+        return None
+    return stream.read_frame()
+
+
+def misfit(frame: Any, width: int, height: int) -> str:
+    """What is wrong with a frame's size or format; empty if nothing."""
+    expected = (width, height, width * 2, width * height * 2)
+    got = (frame.width, frame.height, frame.stride, frame.dataSize)
+    if got != expected:
+        return "it is {}x{} (stride {}, {} bytes), expected {}x{} (stride {}, {} bytes)".format(
+            *got, *expected
+        )
+    if int(frame.videoMode.pixelFormat) != int(openni2.PIXEL_FORMAT_DEPTH_1_MM):
+        return f"it is {mode_text(frame.videoMode)}, expected depth in mm"
+    return ""
+
+
+def run_list(job: dict[str, Any], parent: Parent) -> None:
+    """Say which sensors are there."""
+    initialize(job)
+    version = openni2.get_version()
+    parent.send(
+        "devices",
+        devices=devices(),
+        version=f"{version.major}.{version.minor}.{version.maintenance}.{version.build}",
+    )
+
+
+def run_device(job: dict[str, Any], parent: Parent) -> None:
+    """Deliver a live sensor's frames until told to stop."""
+    initialize(job)
+    slots = Slots(job, parent)
+    live = LiveStream(job, parent)
+    about = describe(live.stream)
+    live.start()
+    parent.send("opened", **about)
+    width, height = about["width"], about["height"]
+    while not parent.stop.is_set():
+        if live.watch.lost.is_set():
+            parent.send("lost")
+            break
+        frame = next_frame(live.stream)
+        if frame is None:
+            parent.send("idle")
+            continue
+        problem = misfit(frame, width, height)
+        slot = None if problem else slots.take(wait=False)
+        if slot is not None:
+            slots.fill(slot, frame.data, frame.dataSize)
+            parent.send("frame", slot=slot, index=frame.frameIndex, timestamp_us=frame.timestamp)
+        elif problem:
+            parent.send("misfit", problem=problem)
+        frame.close()
+    live.close()
+
+
+def open_recording(path: str) -> bytes:
+    """The name under which OpenNI2 can open a recording, whatever its path is like."""
+    if not sys.platform.startswith("linux"):
+        if not path.isascii() or len(path) > 255:
+            raise JobError(
+                "SourceNotFoundError",
+                f"OpenNI2 cannot open '{path}' on this system: the path must be ASCII and at most"
+                " 255 letters. Move the file.",
+            )
+        return path.encode()
+    # A byte above 127 in a path crashes the runtime, 1000 bytes abort it, a FIFO hangs it.
+    # Through its descriptor any file opens, and each reader gets a player of its own.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        raise JobError("DamagedRecordingError", f"'{path}' is not a regular file.")
+    return b"/proc/self/fd/%d" % descriptor
+
+
+def run_recording(job: dict[str, Any], parent: Parent) -> None:
+    """Deliver every frame of a recording, each exactly once."""
+    path = job["path"]
+
+    def damaged(what: str) -> JobError:
+        return JobError(
+            "DamagedRecordingError",
+            f"'{path}' {what}. `selective-depth check` says what can be saved.",
+        )
+
+    initialize(job)
+    slots = Slots(job, parent)
+    try:
+        device = Device(open_recording(path))
+        stream = device.create_depth_stream()
+    except OSError as error:
+        raise JobError(
+            "SourceNotFoundError", f"'{path}' cannot be read: {error.strerror}."
+        ) from error
+    except OpenNIError as error:
+        raise damaged(f"cannot be opened: {reason(error)}") from error
+    if stream is None:
+        raise damaged("holds no depth stream")
+    about = describe(stream)
+    count = stream.get_number_of_frames()
+    width, height = about["width"], about["height"]
+    if count < 1:
+        raise damaged("was not closed when it was recorded: it does not say how many frames it has")
+    if not slots.fits(width * height * 2):
+        raise damaged(f"claims frames of {width}x{height} pixels")
+    # -1.0 is lock-step: the player waits for the reader. As a float: an int is stored as NaN.
+    device.playback.set_speed(-1.0)
+    # With repeat off the player spins after the last frame and may crash; so count instead.
+    device.playback.set_repeat_enabled(True)
+    stream.start()
+    parent.send("opened", **about, frames=count)
+    for expected in range(1, count + 1):
+        frame = None
+        deadline = time.monotonic() + SILENT_FILE_S
+        while frame is None:
+            frame = next_frame(stream)
+            if parent.stop.is_set():
+                return
+            if frame is None and time.monotonic() > deadline:
+                raise damaged(f"gives no frame {expected} of {count}")
+        problem = misfit(frame, width, height)
+        if frame.frameIndex != expected:
+            problem = f"it has number {frame.frameIndex}"
+        if problem:
+            raise damaged(f"has a wrong frame {expected} of {count}: {problem}")
+        slot = slots.take(wait=True)
+        if slot is None:
+            return
+        slots.fill(slot, frame.data, frame.dataSize)
+        parent.send("frame", slot=slot, index=expected - 1, timestamp_us=frame.timestamp)
+        frame.close()
+    parent.send("end")
+
+
+class Recording:
+    """Counts the frames of a recording and notices why it should end."""
+
+    def __init__(self, live: LiveStream, job: dict[str, Any], parent: Parent) -> None:
+        self.frames = 0
+        self._live = live
+        self._job = job
+        self._parent = parent
+        self._started = self._last_frame = self._grown_at = time.monotonic()
+        self._written = 0
+
+    def wait(self) -> None:
+        """Wait for the next frame; the recorder takes it by itself."""
+        frame = next_frame(self._live.stream)
+        if frame is not None:
+            self.frames += 1
+            self._last_frame = time.monotonic()
+            frame.close()
+
+    def ended(self) -> str:
+        """Why it is over; empty if it is not."""
+        now = time.monotonic()
+        if self._parent.stop.is_set():
+            return "stopped"
+        if self._job["frames"] is not None and self.frames >= self._job["frames"]:
+            return "done"
+        if self._job["duration_s"] is not None and now - self._started >= self._job["duration_s"]:
+            return "done"
+        if self._live.watch.lost.is_set():
+            return "the sensor was unplugged"
+        if now - self._last_frame > self._job["stall_s"]:
+            return f"the sensor sent nothing for {self._job['stall_s']:g} s"
+        return self._disk_problem(now)
+
+    def _disk_problem(self, now: float) -> str:
+        # The recorder does not report a failed write; the file itself has to be watched.
+        room = os.fstatvfs(self._job["file"])
+        written = os.fstat(self._job["file"]).st_blocks * 512
+        if written > self._written:
+            self._written, self._grown_at = written, now
+        if room.f_bavail * room.f_frsize < DISK_RESERVE_BYTES:
+            return "the disk is full"
+        if self._last_frame - self._grown_at > NO_GROWTH_S:
+            return "the file does not grow any more"
+        return ""
+
+
+def wait_until_recording(file: int) -> None:
+    """Wait until the recorder takes frames: what comes before it silently drops."""
+    deadline = time.monotonic() + RECORDER_START_S
+    while DATA_BEGIN not in os.pread(file, 1 << 16, 0):
+        if time.monotonic() > deadline:
+            raise JobError(
+                "SourceNotFoundError",
+                "The recording cannot be written: OpenNI2 does not begin the file. Is there room"
+                " on the disk?",
+            )
+        time.sleep(0.005)
+    time.sleep(SETTLE_S)
+
+
+def run_record(job: dict[str, Any], parent: Parent) -> None:
+    """Record a live sensor until enough, told to stop, or something is wrong."""
+    initialize(job)
+    live = LiveStream(job, parent)
+    recorder = openni2.Recorder(b"/proc/self/fd/%d" % job["file"])
+    recorder.attach(live.stream, False)
+    recorder.start()
+    wait_until_recording(job["file"])
+    live.start()
+    parent.send("opened", **describe(live.stream))
+    recording = Recording(live, job, parent)
+    while not (ended := recording.ended()):
+        recording.wait()
+        parent.send("recorded", frames=recording.frames)
+    live.stream.stop()
+    recorder.stop()
+    recorder.close()
+    os.fsync(job["file"])
+    parent.send("saved", ended=ended)
+    live.close()
+
+
+JOBS = {
+    "list": run_list,
+    "device": run_device,
+    "recording": run_recording,
+    "record": run_record,
+}
+
+
+def watch_parent() -> None:
+    """End with the parent even if a process that it forked keeps our pipe open."""
+    parent = os.getppid()
+
+    def wait() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        time.sleep(3)
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def main() -> None:
+    """Do the one job that the parent asks for, then leave without a farewell."""
+    # Ctrl-C reaches every process of a terminal; the parent decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = Parent()
+    watch_parent()
+    job = parent.first_job()
+    try:
+        JOBS[job["job"]](job, parent)
+    except JobError as error:
+        parent.send("error", error=error.kind, message=str(error))
+    except BrokenPipeError:
+        pass  # The parent is gone: there is nobody left to tell.
+    except Exception as error:  # noqa: BLE001 - the parent turns it into a named error
+        parent.send("error", error="DeviceLostError", message=f"{type(error).__name__}: {error}")
+    # What is needed is closed. The library's own clean-up at exit can crash or hang.
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()
