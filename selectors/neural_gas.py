@@ -126,11 +126,11 @@ class NeuralGasSelector:
         return self._regions(seeds, self._live.update(points, seeds.uv))
 
     def _regions(self, seeds: SeedGrid, gas: BatchNeuralGas) -> RegionSelection:
-        camera = seeds.camera
-        nodes_mm = gas.nodes_mm_.copy()
+        # A node that won no seed (fewer seeds than nodes) may lie where there is no surface.
+        camera, nodes_mm = seeds.camera, gas.nodes_mm_[gas.won_]
         return delaunay_regions(
             nodes_mm,
-            gas.nodes_uv_.copy() if camera is None else camera.project_uv(nodes_mm),
+            gas.nodes_uv_[gas.won_] if camera is None else camera.project_uv(nodes_mm),
             seeds.frame_shape,
             edge_metric=self.edge_metric,
             factor=self.factor,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -12,26 +13,30 @@ from numba import njit
 from selective_depth.selectors.neural_gas_exact import draw_nodes
 from selective_depth.selectors.parallel import in_bands
 
-COLD_PASSES = 12
-"""Batch passes of a training from nothing."""
-LIVE_PASSES = 2
-"""Batch passes of an update from the last frame's nodes."""
-REHEAT_PASSES = 8
-"""Batch passes of the update after the scene has changed."""
+COLD_PASSES, COLD_RELOCATIONS = 8, 6
+"""Batch passes of a training from nothing, and after how many of them nodes are moved away."""
+LIVE_PASSES, LIVE_RELOCATIONS = 2, 1
+"""The same for an update from the last frame's nodes."""
 REHEAT_AT = 1.5
 """The scene has changed where the quantisation error jumps by this factor between frames."""
+GAIN = 0.3
+"""Share of its error that a node is expected to lose when a second one is put beside it."""
 
-_NODES_PER_BIN = 2.3
-_ENOUGH = 9  # candidates among which the nearest node is looked for, at least
+_NODES_PER_BIN = 1.6
+_ENOUGH = 9  # nodes among which the two nearest are looked for, at least
 
 
 class BatchNeuralGas:
     """Neural gas trained by batch passes whose winners are searched in nearby image bins.
 
-    Each pass finds the nearest node of every seed among the nodes of the image bins around it
-    (widened until there are enough), and moves each node to the mean of the seeds it won: the
-    batch form of eq. 2 at the end of the annealing, where only the winner moves. Nodes that won
-    nothing are put back at the seeds that are served worst.
+    A pass finds the nearest node of every seed among the nodes of the image bins around it,
+    then moves each node to the mean of the seeds it won: eq. (2) at the end of the annealing,
+    where only the winner moves, for all seeds at once. What the long annealing is for, nodes in
+    the right numbers everywhere, is done directly instead: nodes whose seeds would be served
+    almost as well by their neighbours are put beside nodes that serve theirs badly, as long as
+    that pays (the utility of Fritzke's LBG-U, 1997). Nodes left behind by a moving camera have
+    no utility at all, and nodes at newly seen surfaces large errors, so that the same rule keeps
+    a live training alive.
 
     Parameters
     ----------
@@ -48,13 +53,19 @@ class BatchNeuralGas:
         Nodes in space.
     nodes_uv_ : float32 array of shape (N, 2)
         Mean pixel (column, row) of the seeds each node won.
+    won_ : bool array of shape (N,)
+        Nodes that won a seed of the last frame; the others mean nothing for it.
     quantisation_error_mm_ : float
-        Mean distance of the seeds to their winners.
+        Mean distance of the seeds of the last frame to their winners.
+    reheated_ : bool
+        Whether the last update began anew because the scene had changed.
     """
 
     nodes_mm_: npt.NDArray[np.float32]
     nodes_uv_: npt.NDArray[np.float32]
+    won_: npt.NDArray[np.bool_]
     quantisation_error_mm_: float
+    reheated_: bool
 
     def __init__(self, nodes: int, seed: int, threads: int | None = None) -> None:
         self._nodes = nodes
@@ -73,56 +84,57 @@ class BatchNeuralGas:
         """
         rng = np.random.default_rng(self._seed)
         # One draw for both: a node begins with the place and the pixel of a seed.
-        both = np.concatenate((points_mm, uv), axis=1).astype(np.float32)
+        both = np.concatenate((points_mm, uv), axis=1, dtype=np.float32)
         first = draw_nodes(both, self._nodes, rng)
         self.nodes_mm_ = np.ascontiguousarray(first[:, :3])
         self.nodes_uv_ = np.ascontiguousarray(first[:, 3:])
-        self._passes(points_mm, uv, COLD_PASSES)
+        self.reheated_ = False
+        self._passes(points_mm, uv, COLD_PASSES, COLD_RELOCATIONS)
         return self
 
     def update(self, points_mm: npt.NDArray[np.float32], uv: npt.NDArray[np.int32]) -> Self:
-        """Go on from the last frame's nodes; arguments as for `train`."""
+        """Go on from the last frame's nodes; the first update trains. Arguments as for `train`."""
         if not hasattr(self, "nodes_mm_"):
             return self.train(points_mm, uv)
-        before = self.quantisation_error_mm_
-        first = self._passes(points_mm, uv, LIVE_PASSES)
-        if first > REHEAT_AT * before:
-            self._passes(points_mm, uv, REHEAT_PASSES)
+        most = REHEAT_AT * self.quantisation_error_mm_
+        self.reheated_ = not self._passes(points_mm, uv, LIVE_PASSES, LIVE_RELOCATIONS, most)
+        if self.reheated_:
+            self.train(points_mm, uv)
+            self.reheated_ = True
         return self
 
     def _passes(
-        self, points: npt.NDArray[np.float32], pixels: npt.NDArray[np.int32], passes: int
-    ) -> float:
-        """Take batch passes; returns the quantisation error met by the first."""
+        self,
+        points: npt.NDArray[np.float32],
+        pixels: npt.NDArray[np.int32],
+        passes: int,
+        relocations: int,
+        most: float = math.inf,
+    ) -> bool:
+        """Take batch passes; gives up, returning False, if the first meets an error over `most`."""
         uv = pixels.astype(np.float32)
         low, high = uv.min(axis=0), uv.max(axis=0) + 1
-        area = float(np.prod(high - low))
-        bin_px = max(1.0, math.sqrt(area * _NODES_PER_BIN / self._nodes))
+        bin_px = max(1.0, math.sqrt(float(np.prod(high - low)) * _NODES_PER_BIN / self._nodes))
+        columns, rows = (int(n) for n in (high - low) // bin_px + 1)
         uv -= low
         self.nodes_uv_ -= low
-        columns, rows = (int(n) for n in (high - low) // bin_px + 1)
-        label = np.empty(len(points), dtype=np.int32)
-        d2 = np.empty(len(points), dtype=np.float32)
-        errors = []
+        winner = np.empty(len(points), dtype=np.int32)
+        d2 = np.empty((2, len(points)), dtype=np.float32)
         for number in range(passes + 1):
             bins = _sort_into_bins(self.nodes_mm_, self.nodes_uv_, bin_px, rows, columns)
-
-            def search(start: int, end: int, bins: tuple[object, ...] = bins) -> None:
-                _assign(points, uv, bin_px, rows, columns, *bins, label, d2, start, end)
-
+            search = partial(_find_two, points, uv, bin_px, rows, columns, *bins, winner, d2)
             in_bands(search, len(points), self._threads)
-            errors.append(float(np.sqrt(d2).mean()))
-            if number == passes:
+            error = float(np.sqrt(d2[0]).mean())
+            if error > most:
                 break
-            wins = _move_to_means(points, uv, label, self.nodes_mm_, self.nodes_uv_)
-            idle = np.flatnonzero(wins == 0)[: len(points)]
-            if len(idle):
-                worst = np.argpartition(d2, -len(idle))[-len(idle) :]
-                self.nodes_mm_[idle] = points[worst]
-                self.nodes_uv_[idle] = uv[worst]
+            most = math.inf
+            if number < passes:
+                _move(points, uv, winner, d2, self.nodes_mm_, self.nodes_uv_, number < relocations)
         self.nodes_uv_ += low
-        self.quantisation_error_mm_ = errors[-1]
-        return errors[0]
+        self.won_ = np.zeros(self._nodes, dtype=np.bool_)
+        self.won_[winner] = True
+        self.quantisation_error_mm_ = error
+        return error <= most
 
 
 def train_fast(
@@ -162,17 +174,23 @@ def _sort_into_bins(nodes, nodes_uv, bin_px, rows, columns):  # type: ignore[no-
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz", "contract"})
-def _assign(points, uv, bin_px, rows, columns, starts, number, xyz, label, d2, first, end):  # type: ignore[no-untyped-def]
-    """Nearest node of the seeds first..end among the bins around each, and its distance."""
+def _find_two(  # type: ignore[no-untyped-def]
+    points, uv, bin_px, rows, columns, starts, number, xyz, winner, d2, first, end
+):
+    """Winners of the seeds first..end among the bins around each; distances of the nearest two."""
     sx, sy, sz = xyz[0], xyz[1], xyz[2]
+    far = np.float32(3e38)
+    per_px = np.float32(1 / bin_px)
     for p in range(first, end):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        c = min(int(uv[p, 0] / bin_px), columns - 1)
-        r = min(int(uv[p, 1] / bin_px), rows - 1)
-        best = np.float32(3e38)
-        at = 0
-        ring = 1
-        while True:
+        c = min(np.int32(uv[p, 0] * per_px), columns - 1)
+        r = min(np.int32(uv[p, 1] * per_px), rows - 1)
+        one, two, at = far, far, 0
+        met = 0
+        ring = 0
+        while met < _ENOUGH and ring < max(rows, columns):
+            ring += 1
+            one, two, at = far, far, 0
             met = 0
             left, right = max(c - ring, 0), min(c + ring, columns - 1)
             for row in range(max(r - ring, 0), min(r + ring, rows - 1) + 1):
@@ -184,32 +202,68 @@ def _assign(points, uv, bin_px, rows, columns, starts, number, xyz, label, d2, f
                     dy = sy[j] - y
                     dz = sz[j] - z
                     d = dx * dx + dy * dy + dz * dz
-                    if d < best:
-                        best = d
-                        at = j
-            if met >= _ENOUGH or ring >= max(rows, columns):
-                break
-            ring += 1
-        label[p] = number[at]
-        d2[p] = best
+                    # Choices, not branches: which node is nearer is not predictable.
+                    nearer = d < one
+                    loser = one if nearer else d
+                    two = loser if loser < two else two
+                    at = j if nearer else at
+                    one = d if nearer else one
+        winner[p] = number[at]
+        d2[0, p], d2[1, p] = one, two
 
 
 @njit(cache=True, nogil=True)
-def _move_to_means(points, uv, label, nodes, nodes_uv):  # type: ignore[no-untyped-def]
-    """Move every node to the mean of the seeds it won; returns how many each won."""
-    sums = np.zeros((len(nodes), 5), np.float32)
-    wins = np.zeros(len(nodes), np.int32)
+def _move(points, uv, winner, d2, nodes, nodes_uv, relocate):  # type: ignore[no-untyped-def]
+    """Move nodes to the means of the seeds they won; relocate those that are of little use."""
+    count = len(nodes)
+    sums = np.zeros((count, 6), np.float32)
+    error = np.zeros(count, np.float32)
+    utility = np.zeros(count, np.float32)
+    worst = np.full(count, -1, np.int32)
     for p in range(len(points)):
-        j = label[p]
-        wins[j] += 1
+        j = winner[p]
         for k in range(3):
             sums[j, k] += points[p, k]
         for k in range(2):
             sums[j, 3 + k] += uv[p, k]
-    for j in range(len(nodes)):
-        if wins[j] > 0:
+        sums[j, 5] += np.float32(1)
+        error[j] += d2[0, p]
+        utility[j] += d2[1, p] - d2[0, p]
+        if worst[j] < 0 or d2[0, p] > d2[0, worst[j]]:
+            worst[j] = p
+    for j in range(count):
+        if sums[j, 5] > 0:
+            share = np.float32(1) / sums[j, 5]
             for k in range(3):
-                nodes[j, k] = sums[j, k] / wins[j]
+                nodes[j, k] = sums[j, k] * share
             for k in range(2):
-                nodes_uv[j, k] = sums[j, 3 + k] / wins[j]
-    return wins
+                nodes_uv[j, k] = sums[j, 3 + k] * share
+    if not relocate:
+        return
+    # As many nodes of the lowest utility as there are errors that outweigh them: the level at
+    # which the two counts meet, by bisection, needs no sorting.
+    low, high = np.float32(0), GAIN * error.max()
+    for _ in range(24):
+        level = np.float32(0.5) * (low + high)
+        useless = 0
+        needed = 0
+        for j in range(count):
+            useless += np.int32(utility[j] < level)
+            needed += np.int32(GAIN * error[j] > level)
+        if useless < needed:
+            low = level
+        else:
+            high = level
+    j = 0
+    for target in range(count):
+        if GAIN * error[target] > high:
+            while j < count and utility[j] >= high:
+                j += 1
+            if j == count:
+                return
+            p = worst[target]
+            for k in range(3):
+                nodes[j, k] = points[p, k]
+            for k in range(2):
+                nodes_uv[j, k] = uv[p, k]
+            j += 1

@@ -9,14 +9,16 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from numba import njit
-from scipy.spatial import Delaunay, QhullError
 
+from selective_depth.selectors.delaunay import Mesh
 from selective_depth.selectors.selection import Selection
 
 EdgeMetric = Literal["3d", "image"]
 """Where the length of an edge is measured: in space (mm) or in the image (pixels)."""
 
-_OUTSIDE, _KEPT, _LONG = 0, 1, 2
+_KEPT, _LONG = 1, 2  # 0 is outside of all triangles
+_STEPS_PER_PX = 8.0
+_STEPS = 2.0**14  # along the longer side at most: the largest the exact predicates are sure for
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +117,7 @@ def delaunay_regions(
         raise ValueError(f"edge_metric is {edge_metric!r}; give '3d' or 'image'")
     if not factor > 0:
         raise ValueError(f"factor is {factor}; the threshold must be positive, 1 is the mean edge")
-    triangles = triangulate(nodes_uv)
+    triangles, drawn_uv = triangulate(nodes_uv)
     corners = (nodes_mm if edge_metric == "3d" else nodes_uv)[triangles]
     edge_lengths = np.sqrt(np.square(corners - np.roll(corners, -1, axis=1)).sum(axis=2))
     threshold = factor * float(edge_lengths.mean()) if len(triangles) else 0.0
@@ -125,7 +127,7 @@ def delaunay_regions(
     state = np.zeros(frame_shape, dtype=np.uint8)
     worth = np.where(kept, 1 - longest / max(threshold, 1e-30), 0).astype(np.float32)
     _rasterise(
-        nodes_uv[triangles], np.where(kept, _KEPT, _LONG).astype(np.uint8), worth, state, score
+        drawn_uv[triangles], np.where(kept, _KEPT, _LONG).astype(np.uint8), worth, state, score
     )
     return RegionSelection(
         mask=state == _KEPT,
@@ -143,8 +145,13 @@ def delaunay_regions(
     )
 
 
-def triangulate(uv: npt.NDArray[np.float32]) -> npt.NDArray[np.int32]:
+def triangulate(
+    uv: npt.NDArray[np.float32],
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """Delaunay triangulation of points of the image plane.
+
+    The points are first rounded to a fraction of a pixel: in whole numbers the triangulation is
+    exact, so that no rounding can make it inconsistent, and points in one place are seen to be.
 
     Parameters
     ----------
@@ -153,16 +160,24 @@ def triangulate(uv: npt.NDArray[np.float32]) -> npt.NDArray[np.int32]:
 
     Returns
     -------
-    int32 array of shape (T, 3)
-        Indices of points; (0, 3) where all points lie on one line.
+    triangles : int32 array of shape (T, 3)
+        Indices of points; of points in one place only one is used. (0, 3) where all points lie
+        on one line.
+    rounded_uv : float32 array of shape (N, 2)
+        The points as triangulated.
     """
-    nothing = np.zeros((0, 3), dtype=np.int32)
-    if len(uv) < 3:
-        return nothing
-    try:
-        return np.ascontiguousarray(Delaunay(uv).simplices, dtype=np.int32)
-    except QhullError:  # Qhull's name for points on one line
-        return nothing
+    if len(uv) == 0:
+        return np.zeros((0, 3), np.int32), uv
+    low = uv.min(axis=0)
+    extent = float((uv - low).max())
+    per_px = min(_STEPS_PER_PX, _STEPS / max(extent, 1.0))
+    steps = np.rint((uv - low) * np.float32(per_px)).astype(np.int32)
+    rounded_uv = (steps / np.float32(per_px) + low).astype(np.float32)
+    _, first = np.unique(steps[:, 1].astype(np.int64) << 32 | steps[:, 0], return_index=True)
+    mesh = Mesh.of(steps[first])
+    if mesh is None:
+        return np.zeros((0, 3), np.int32), rounded_uv
+    return first.astype(np.int32)[mesh.real_triangles()], rounded_uv
 
 
 @njit(cache=True, nogil=True)
