@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -118,16 +119,20 @@ def delaunay_regions(
     if not factor > 0:
         raise ValueError(f"factor is {factor}; the threshold must be positive, 1 is the mean edge")
     triangles, drawn_uv = triangulate(nodes_uv)
-    corners = (nodes_mm if edge_metric == "3d" else nodes_uv)[triangles]
-    edge_lengths = np.sqrt(np.square(corners - np.roll(corners, -1, axis=1)).sum(axis=2))
-    threshold = factor * float(edge_lengths.mean()) if len(triangles) else 0.0
+    edge_lengths = _edge_lengths(nodes_mm if edge_metric == "3d" else nodes_uv, triangles)
+    threshold = factor * float(edge_lengths.mean(dtype=np.float64)) if len(triangles) else 0.0
     longest = edge_lengths.max(axis=1) if len(triangles) else np.zeros(0, np.float32)
     kept = longest <= threshold
     score = np.zeros(frame_shape, dtype=np.float32)
     state = np.zeros(frame_shape, dtype=np.uint8)
     worth = np.where(kept, 1 - longest / max(threshold, 1e-30), 0).astype(np.float32)
     _rasterise(
-        drawn_uv[triangles], np.where(kept, _KEPT, _LONG).astype(np.uint8), worth, state, score
+        drawn_uv.astype(np.float64),
+        triangles,
+        np.where(kept, _KEPT, _LONG).astype(np.uint8),
+        worth,
+        state,
+        score,
     )
     return RegionSelection(
         mask=state == _KEPT,
@@ -181,37 +186,50 @@ def triangulate(
 
 
 @njit(cache=True, nogil=True)
-def _crossing(ax, ay, bx, by, y):  # type: ignore[no-untyped-def]
-    """Where the edge meets a row; the same bits from both of its triangles."""
-    if ay > by or (ay == by and ax > bx):
-        ax, ay, bx, by = bx, by, ax, ay
-    return ax + (y - ay) * ((bx - ax) / (by - ay))
+def _edge_lengths(nodes, triangles):  # type: ignore[no-untyped-def]
+    """Length of the edges of each triangle, from corner k to corner k + 1."""
+    lengths = np.empty(triangles.shape, np.float32)
+    for t in range(len(triangles)):
+        for k in range(3):
+            a, b = triangles[t, k], triangles[t, (k + 1) % 3]
+            square = np.float32(0)
+            for axis in range(nodes.shape[1]):
+                d = nodes[a, axis] - nodes[b, axis]
+                square += d * d
+            lengths[t, k] = math.sqrt(square)
+    return lengths
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _slope(a, b):  # type: ignore[no-untyped-def]
+    """Columns per row along an edge from a down to b."""
+    return (b[0] - a[0]) / (b[1] - a[1]) if b[1] > a[1] else 0.0
 
 
 @njit(cache=True, nogil=True)
-def _rasterise(corners, states, worths, state, score):  # type: ignore[no-untyped-def]
-    """Paint each pixel whose centre lies in a triangle; a pixel on an edge is painted once."""
+def _rasterise(uv, triangles, states, worths, state, score):  # type: ignore[no-untyped-def]
+    """Paint each pixel whose centre lies in a triangle; a pixel on an edge is painted once.
+
+    An edge's crossing with a row is computed from its upper end, by the same formula for both
+    of its triangles: they share it to the last bit, and leave no gap.
+    """
     height, width = state.shape
-    for t in range(len(corners)):
-        a, b, c = corners[t, 0], corners[t, 1], corners[t, 2]
-        # Corners from top to bottom: a row then crosses the long edge and one of the others.
+    for t in range(len(triangles)):
+        a, b, c = uv[triangles[t, 0]], uv[triangles[t, 1]], uv[triangles[t, 2]]
         if b[1] < a[1]:
             a, b = b, a
         if c[1] < b[1]:
             b, c = c, b
             if b[1] < a[1]:
                 a, b = b, a
-        first = max(int(np.ceil(a[1])), 0)
-        end = min(int(np.ceil(c[1])), height)
-        for row in range(first, end):
-            y = float(row)
-            one = _crossing(float(a[0]), float(a[1]), float(c[0]), float(c[1]), y)
-            if y < b[1]:
-                other = _crossing(float(a[0]), float(a[1]), float(b[0]), float(b[1]), y)
-            else:
-                other = _crossing(float(b[0]), float(b[1]), float(c[0]), float(c[1]), y)
-            left = max(int(np.ceil(min(one, other))), 0)
-            right = min(int(np.ceil(max(one, other))), width)
+        # Now from top to bottom: a row crosses the edge ac and one of the others.
+        ac, ab, bc = _slope(a, c), _slope(a, b), _slope(b, c)
+        painted, worth = states[t], worths[t]
+        for row in range(max(math.ceil(a[1]), 0), min(math.ceil(c[1]), height)):
+            one = a[0] + (row - a[1]) * ac
+            other = a[0] + (row - a[1]) * ab if row < b[1] else b[0] + (row - b[1]) * bc
+            left = max(math.ceil(min(one, other)), 0)
+            right = min(math.ceil(max(one, other)), width)
             for column in range(left, right):
-                state[row, column] = states[t]
-                score[row, column] = worths[t]
+                state[row, column] = painted
+                score[row, column] = worth
