@@ -42,7 +42,7 @@ from selective_depth.drivers.oni_records import (
 from selective_depth.drivers.source import SourceNotFoundError
 
 _STREAMS: Final = frozenset((NodeType.DEPTH, NodeType.IMAGE, NodeType.IR))
-_CODECS: Final = frozenset((*DEPTH_CODECS, b"JPEG", b"Im8z"))
+CODECS: Final = frozenset((*DEPTH_CODECS, b"JPEG", b"Im8z"))
 _MAX_NODES: Final = 64
 _MILLIMETRES: Final = 100
 """OpenNI2's number of the pixel format "depth in millimetres"."""
@@ -396,7 +396,7 @@ class _Inspection:
                 f"node {record.node} is beyond the highest that the header states,"
                 f" {self.highest_node}"
             )
-        if addition.node_type in _STREAMS and addition.codec not in _CODECS:
+        if addition.node_type in _STREAMS and addition.codec not in CODECS:
             raise RecordError(f"the compression {addition.codec!r} is not known")
 
     def _begin(self, node: OniNode, record: Record) -> None:
@@ -491,11 +491,10 @@ class _Inspection:
             return None, 30.0
         if node.codec not in DEPTH_CODECS:
             return None, fps
-        if node.number_of("oniPixelFormat") not in (None, _MILLIMETRES):
+        pixel_format = node.number_of("oniPixelFormat")
+        if pixel_format not in (None, _MILLIMETRES):
             self._problem(
-                node.offset,
-                f"the pixels have format {node.number_of('oniPixelFormat')}, which is not"
-                " millimetres",
+                node.offset, f"the pixels have format {pixel_format}, which is not millimetres"
             )
             return None, fps
         cropping = node.values_of("xnCropping", "<IHHHH")
@@ -506,14 +505,16 @@ class _Inspection:
         elif cropping[0]:
             self._problem(node.offset, "the frames are cropped, which cannot be replayed")
             return None, fps
-        if node.number_of("oniRequiredFrameSize") not in (None, 2 * width * height):
+        frame_bytes = node.number_of("oniRequiredFrameSize")
+        if frame_bytes not in (None, 2 * width * height):
+            del node.properties["oniRequiredFrameSize"]
             self._problem(
-                node.offset,
-                f"frames of {width}x{height} do not have"
-                f" {node.number_of('oniRequiredFrameSize')} bytes",
+                node.offset, f"frames of {width}x{height} do not have {frame_bytes} bytes"
             )
-        if node.codec == CODEC_TABLE and not 1 <= (node.number_of("xnDeviceMaxDepth") or 0) < 65536:
-            self._problem(node.offset, "the largest depth is not recorded, or wrong")
+        max_depth_mm = node.number_of("xnDeviceMaxDepth")
+        if node.codec == CODEC_TABLE and not 1 <= (max_depth_mm or 0) < 65536:
+            node.properties.pop("xnDeviceMaxDepth", None)
+            self._problem(node.offset, f"the largest depth cannot be {max_depth_mm} mm")
         return self._camera(node, width, height), fps
 
     def _camera(self, node: OniNode, width: int, height: int) -> Camera:
@@ -522,6 +523,7 @@ class _Inspection:
             try:
                 return Camera.from_fov(width, height, *fov)
             except ValueError as error:
+                del node.properties["xnFOV"]
                 self._problem(node.offset, f"{error}")
         return Camera.kinect(width, height)
 

@@ -1,0 +1,226 @@
+"""Replay and rescue of .oni files without OpenNI2."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.oni_codec import decode_depth
+from selective_depth.drivers.oni_file import CODECS, OniFrame, OniReport, inspect_oni, read_payload
+from selective_depth.drivers.oni_records import NodeAddition
+from selective_depth.drivers.oni_writer import RecordWriter, depth_properties
+from selective_depth.drivers.recorded import FolderWriter
+from selective_depth.drivers.source import (
+    DamagedRecordingError,
+    DepthSource,
+    SourceEndedError,
+    SourceNotFoundError,
+)
+
+
+class OniReader(DepthSource):
+    """The depth frames of an .oni file, each exactly once, decoded here.
+
+    Delivers what OpenNI2 delivers, bit by bit, but needs no runtime and runs no native code on
+    the file. A damaged file is read up to the damage; a recording whose recorder was killed is
+    read to its last whole frame.
+
+    Parameters
+    ----------
+    path : str or Path
+        The recording.
+
+    Attributes
+    ----------
+    report : OniReport
+        What was found in the file.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If there is no such file.
+    DamagedRecordingError
+        If it is no recording, or no frame comes before the damage.
+    """
+
+    live = False
+
+    def __init__(self, path: str | Path) -> None:
+        self.uri = str(path)
+        self.report = inspect_oni(path)
+        self.dropped = 0
+        self._frames, self._damage = _trusted_frames(self.report)
+        if self._damage is not None and not self._frames:
+            raise DamagedRecordingError(self._sentence(self._damage))
+        if not self._frames or self.report.depth is None or self.report.camera is None:
+            raise DamagedRecordingError(f"'{path}' holds no depth frames; was it ever recorded to?")
+        self.camera = self.report.camera
+        self.fps = self.report.fps
+        self.frame_count = len(self._frames)
+        self._codec = self.report.depth.codec
+        self._next = 0
+        self._file: BinaryIO | None = _open(self.report.path)
+
+    def read(self, timeout_s: float = 5.0) -> DepthFrame:
+        """Return the next frame; `timeout_s` does not matter, a file does not keep one waiting.
+
+        Raises
+        ------
+        SourceEndedError
+            After the last frame.
+        DamagedRecordingError
+            Where the file is damaged; frames already delivered are good.
+        """
+        if self._file is None:
+            raise SourceEndedError(f"'{self.uri}' has been closed.")
+        if self._next == len(self._frames):
+            if self._damage is not None:
+                raise DamagedRecordingError(self._sentence(self._damage))
+            raise SourceEndedError(f"'{self.uri}' has ended after {self._next} frames.")
+        frame = self._frames[self._next]
+        depth_mm = decode_depth(
+            self._codec, read_payload(self._file, frame), self.camera.height, self.camera.width
+        )
+        if depth_mm is None:
+            self._frames = self._frames[: self._next]
+            self._damage = f"byte {frame.record_offset}: frame {frame.number} cannot be decoded"
+            raise DamagedRecordingError(self._sentence(self._damage))
+        index = self._next
+        self._next += 1
+        return DepthFrame(depth_mm, index, frame.timestamp_us, self.camera, self.uri)
+
+    def close(self) -> None:
+        """Close the file. Harmless when called twice."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _sentence(self, damage: str) -> str:
+        return (
+            f"'{self.uri}' cannot be read beyond frame {len(self._frames)} ({damage})."
+            " `selective-depth check` says what can be saved."
+        )
+
+
+def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
+    """Write what is readable of an .oni file to a new one that OpenNI2 replays.
+
+    Every stream is kept, compressed as it was; frames that are damaged are left out and the rest
+    numbered anew. An .oni file whose recorder was killed comes back whole.
+
+    Parameters
+    ----------
+    path : str or Path
+        The damaged file; it is not changed.
+    out_path : str or Path
+        The new file; must not exist.
+
+    Returns
+    -------
+    OniReport
+        Of the new file, every frame decoded.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If there is no such file.
+    DamagedRecordingError
+        If no depth frame can be read.
+    OutputError
+        If the new file exists or cannot be written.
+    """
+    report = _rescuable(path)
+    assert report.depth is not None and report.camera is not None
+    defaults = depth_properties(report.camera, report.fps)
+    with _open(report.path) as file:
+        writer = RecordWriter(Path(out_path))
+        try:
+            frames: list[tuple[int, OniFrame]] = []
+            for node in report.nodes:
+                if node.is_stream and not (node.ready and node.codec in CODECS):
+                    continue
+                known = defaults if node is report.depth else {}
+                properties = {**known, **node.properties}
+                addition = NodeAddition(node.name, node.node_type, node.codec, None, 0)
+                writer.add_node(node.number, addition, properties)
+                frames += [(node.number, frame) for frame in node.frames]
+            writer.begin()
+            for number, frame in sorted(frames, key=lambda item: item[1].record_offset):
+                writer.add_frame(number, frame.timestamp_us, read_payload(file, frame))
+        finally:
+            writer.close()
+    return inspect_oni(out_path, decode=True, timeout_s=float("inf"))
+
+
+def export_oni(
+    path: str | Path, folder: str | Path, progress: Callable[[int], None] | None = None
+) -> OniReport:
+    """Save every readable depth frame of an .oni file, damaged or not, as a folder of PNG files.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    folder : str or Path
+        The folder; made if it is not there. It must not hold PNG files yet.
+    progress : callable, optional
+        Called with the number of frames saved so far.
+
+    Returns
+    -------
+    OniReport
+        Of the .oni file; its `readable_frames` were saved.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If there is no such file.
+    DamagedRecordingError
+        If no depth frame can be read.
+    OutputError
+        If the folder cannot be written.
+    """
+    report = _rescuable(path)
+    depth, camera = report.depth, report.camera
+    assert depth is not None and camera is not None
+    with _open(report.path) as file, FolderWriter(folder, fps=report.fps) as out:
+        for index, frame in enumerate(depth.frames):
+            depth_mm = decode_depth(
+                depth.codec, read_payload(file, frame), camera.height, camera.width
+            )
+            if depth_mm is None:
+                raise DamagedRecordingError(f"'{path}' has changed while it was read.")
+            out.write(DepthFrame(depth_mm, index, frame.timestamp_us, camera, str(path)))
+            if progress is not None:
+                progress(index + 1)
+    return report
+
+
+def _trusted_frames(report: OniReport) -> tuple[list[OniFrame], str | None]:
+    """Frames before the first damage, and what that is; None if the file is sound."""
+    frames = report.depth.frames if report.depth is not None else []
+    damage = next((problem for problem in report.problems if not problem.harmless), None)
+    if damage is None:
+        return frames, None
+    return [frame for frame in frames if frame.record_offset < damage.offset], str(damage)
+
+
+def _rescuable(path: str | Path) -> OniReport:
+    report = inspect_oni(path, decode=True, timeout_s=float("inf"))
+    if report.readable_frames == 0 or report.camera is None:
+        why = f" ({report.problems[0]})" if report.problems else ""
+        raise DamagedRecordingError(
+            f"nothing can be saved of '{path}': no depth frame in it is readable{why}."
+        )
+    return report
+
+
+def _open(path: Path) -> BinaryIO:
+    try:
+        return path.open("rb", buffering=0)
+    except OSError as error:
+        raise SourceNotFoundError(
+            f"'{path}' cannot be read ({error.strerror}); check its permissions."
+        ) from error
