@@ -40,21 +40,22 @@ BASELINE_MM = 75.0
 STEPS_PER_PX = 8
 """Disparity is told in steps of one eighth of a pixel of a 640x480 image."""
 
-NOISE_PX = 0.05
+NOISE_PX = 0.055
 """Standard deviation of disparity before it is rounded, pixels of a 640x480 image."""
 
 NEAREST_MM, FARTHEST_MM = 500, 9000
 """Depth outside is not reported; 9 m is where a perfectly white surface is lost."""
 
 _SHARED = 0.8  # of the variance of the disparity error is common to neighbouring pixels
-_CELL = 4  # pixels between the nodes of a shared field
-_RAGGED_PX = 1.1  # standard deviation of the look-up's shift
-_STEEPEST = 0.22  # disparity change per pixel beyond which windows do not match
+_ERROR_CELL = 5  # pixels between the nodes of the shared error
+_WOBBLE_CELL = 8  # the same of the outlines' wobble and of patches that return less light
+_RAGGED_PX = 0.85  # standard deviation of the wobble
 _PATCHY = 0.3  # standard deviation of the light needed for a match, relative
+_STEEPEST = 0.22  # disparity change per pixel beyond which windows do not match
 _BORDER_PX = 8  # columns without a full window
 _SHADOW_PX = 0.7  # slack of the shadow test
 
-_DISPARITY, _SHIFT_U, _SHIFT_V, _LIGHT = range(4)  # the shared fields
+_SHIFT_U, _SHIFT_V, _LIGHT = range(3)  # the fields of wobble
 
 # A sum of four uniform numbers has a standard deviation of sqrt(1 / 3); bilinear interpolation
 # leaves (2/3)^2 of the nodes' variance on average.
@@ -109,14 +110,14 @@ def kinect_depth(
     """
     height, width = nearness.shape
     state = np.array([(seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019) % 2**64], np.uint64)
-    fields = np.empty((4, height // _CELL + 2, width // _CELL + 2), np.float32)
+    error = _field(1, _ERROR_CELL, height, width, state)
+    wobble = _field(3, _WOBBLE_CELL, height, width, state)
     strength = np.empty((height, width), np.float32)
     depth_mm = np.empty((height, width), np.uint16)
     parallax = _parallax(camera)
     light = (albedo * FARTHEST_MM**2).astype(np.float32)
-    _fill_fields(fields, state)
     _match(nearness, material, light, parallax, width / 640, camera.fx, strength)
-    _measure(nearness, strength, fields, parallax, depth_steps(camera), state, depth_mm)
+    _measure(nearness, strength, error, wobble, parallax, depth_steps(camera), state, depth_mm)
     return depth_mm
 
 
@@ -126,30 +127,50 @@ def _parallax(camera: Camera) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _normal(state):  # type: ignore[no-untyped-def]
-    """A nearly normal number from one step of xorshift64* (Vigna 2016): four 16-bit parts."""
-    x = state[0]
+def _next(x):  # type: ignore[no-untyped-def]
+    """One step of xorshift64 (Marsaglia 2003)."""
     x ^= x >> np.uint64(12)
     x ^= x << np.uint64(25)
-    x ^= x >> np.uint64(27)
-    state[0] = x
-    x *= np.uint64(0x2545F4914F6CDD1D)
-    low = np.uint64(0xFFFF)
-    total = (
-        np.int64(x & low)
-        + np.int64((x >> np.uint64(16)) & low)
-        + np.int64((x >> np.uint64(32)) & low)
-        + np.int64(x >> np.uint64(48))
-    )
-    return np.float32((total * (1.0 / 65536.0) - 2.0) * _FROM_SUM)
+    return x ^ (x >> np.uint64(27))
 
 
 @njit(cache=True, nogil=True)
-def _fill_fields(fields, state):  # type: ignore[no-untyped-def]
-    for k in range(fields.shape[0]):
-        for row in range(fields.shape[1]):
-            for column in range(fields.shape[2]):
-                fields[k, row, column] = np.float32(_FROM_FIELD) * _normal(state)
+def _normal(x):  # type: ignore[no-untyped-def]
+    """A nearly normal number: the sum of the four 16-bit parts of a state of xorshift64*."""
+    x *= np.uint64(0x2545F4914F6CDD1D)
+    # Two by two, side by side in one word: 17 bits hold a sum of two.
+    pairs = (x & np.uint64(0x0000FFFF0000FFFF)) + (
+        (x >> np.uint64(16)) & np.uint64(0x0000FFFF0000FFFF)
+    )
+    total = np.int32((pairs & np.uint64(0xFFFFFFFF)) + (pairs >> np.uint64(32)))
+    return np.float32(total) * np.float32(_FROM_SUM / 65536.0) - np.float32(2.0 * _FROM_SUM)
+
+
+@njit(cache=True, nogil=True)
+def _field(count, cell, height, width, state):  # type: ignore[no-untyped-def]
+    """Nodes of smooth random fields of unit variance, `cell` pixels apart."""
+    x = state[0]
+    nodes = np.empty((count, height // cell + 2, width // cell + 2), np.float32)
+    for k in range(count):
+        for row in range(nodes.shape[1]):
+            for column in range(nodes.shape[2]):
+                x = _next(x)
+                nodes[k, row, column] = np.float32(_FROM_FIELD) * _normal(x)
+    state[0] = x
+    return nodes
+
+
+@njit(cache=True, nogil=True)
+def _line(nodes, cell, row, line):  # type: ignore[no-untyped-def]
+    """One image row of a field."""
+    part = np.float32(row % cell) / np.float32(cell)
+    upper, lower = nodes[row // cell], nodes[row // cell + 1]
+    for node in range(len(upper) - 1):
+        here = upper[node] + part * (lower[node] - upper[node])
+        there = upper[node + 1] + part * (lower[node + 1] - upper[node + 1])
+        step = (there - here) / np.float32(cell)
+        for k in range(min(cell, len(line) - node * cell)):
+            line[node * cell + k] = here + step * np.float32(k)
 
 
 @njit(cache=True, nogil=True)
@@ -157,56 +178,64 @@ def _match(nearness, material, light, parallax, scale, focal, strength):  # type
     """How well each pixel's window matches; 1 is the limit, 0 is hopeless."""
     height, width = nearness.shape
     border = width - math.ceil(_BORDER_PX * scale)
+    steepness = np.float32((parallax / (scale * _STEEPEST)) ** 2)
+    lens = np.float32(focal * focal)
+    per_q = np.float32(parallax * scale)
+    one, tiny = np.float32(1.0), np.float32(1e-12)
     for row in range(height):
-        above, below = max(row - 1, 0), min(row + 1, height - 1)
-        reached = np.float32(1e9)  # leftmost projector column lit so far, coming from the right
-        for column in range(width - 1, -1, -1):
-            q = nearness[row, column]
-            disparity = np.float32(parallax) * q
-            lit = np.float32(column) - disparity * np.float32(scale)
-            if q == 0.0 or column >= border or lit > reached + np.float32(_SHADOW_PX):
-                strength[row, column] = 0.0
-                reached = min(reached, lit)
-                continue
-            reached = min(reached, lit)
-            left, right = max(column - 1, 0), min(column + 1, width - 1)
+        line, out = nearness[row], strength[row]
+        above, below = nearness[max(row - 1, 0)], nearness[min(row + 1, height - 1)]
+        out[0] = 0.0
+        out[border:] = 0.0
+        for column in range(1, border):
+            q = line[column]
             # The smaller of both differences: a step beside a pixel does not make it steep.
-            du = min(abs(nearness[row, right] - q), abs(q - nearness[row, left]))
-            dv = min(abs(nearness[below, column] - q), abs(q - nearness[above, column]))
-            square = (du * du + dv * dv) / (q * q)  # of the relative slope per pixel
-            steep = disparity * disparity * square / np.float32(scale * scale * _STEEPEST**2)
-            facing = np.float32(1.0) / (np.float32(1.0) + square * np.float32(focal * focal))
-            back = light[material[row, column]] * q * q * math.sqrt(facing)
-            strength[row, column] = min(back, np.float32(1.0) / max(steep, np.float32(1e-6)))
+            du = min(abs(line[column + 1] - q), abs(q - line[column - 1]))
+            dv = min(abs(below[column] - q), abs(q - above[column]))
+            slope = du * du + dv * dv
+            square = q * q
+            # A surface turned away by an angle a returns cos(a) of the light.
+            cosine = math.sqrt(square / (square + slope * lens + tiny))
+            back = light[material[row, column]] * square * cosine
+            out[column] = min(back, one / (slope * steepness + tiny))
+        # The projector stands to the right: what lies left of a nearer surface is in its shadow.
+        lit = np.float32(width)
+        for column in range(width - 1, -1, -1):
+            place = np.float32(column) - per_q * line[column]
+            if place > lit + np.float32(_SHADOW_PX):
+                out[column] = 0.0
+            lit = min(lit, place)
 
 
 @njit(cache=True, nogil=True)
-def _measure(nearness, strength, fields, parallax, depths, state, depth_mm):  # type: ignore[no-untyped-def]
+def _measure(nearness, strength, error, wobble, parallax, depths, state, depth_mm):  # type: ignore[no-untyped-def]
     height, width = nearness.shape
-    nodes = np.empty((fields.shape[0], fields.shape[2]), np.float32)
     gain = np.float32(STEPS_PER_PX * parallax)
     shared = np.float32(STEPS_PER_PX * NOISE_PX * math.sqrt(_SHARED))
     own = np.float32(STEPS_PER_PX * NOISE_PX * math.sqrt(1.0 - _SHARED))
-    half = np.float32(0.5)
+    ragged, patchy = np.float32(_RAGGED_PX), np.float32(_PATCHY)
+    one = np.float32(1.0)
+    errors = np.empty(width, np.float32)
+    wobbles = np.empty((3, width), np.float32)
+    x = state[0]
     for row in range(height):
-        part = np.float32(row % _CELL) / np.float32(_CELL)
-        for k in range(nodes.shape[0]):
-            for node in range(nodes.shape[1]):
-                upper, lower = fields[k, row // _CELL, node], fields[k, row // _CELL + 1, node]
-                nodes[k, node] = upper + part * (lower - upper)
+        _line(error[0], _ERROR_CELL, row, errors)
+        for k in range(3):
+            _line(wobble[k], _WOBBLE_CELL, row, wobbles[k])
         for column in range(width):
-            node = column // _CELL
-            share = np.float32(column % _CELL) / np.float32(_CELL)
-            rest = np.float32(1.0) - share
-            shift_u = rest * nodes[_SHIFT_U, node] + share * nodes[_SHIFT_U, node + 1]
-            shift_v = rest * nodes[_SHIFT_V, node] + share * nodes[_SHIFT_V, node + 1]
-            u = column + math.floor(np.float32(_RAGGED_PX) * shift_u + half)
-            v = row + math.floor(np.float32(_RAGGED_PX) * shift_v + half)
-            u, v = min(max(u, 0), width - 1), min(max(v, 0), height - 1)
-            patch = rest * nodes[_LIGHT, node] + share * nodes[_LIGHT, node + 1]
-            if strength[v, u] < np.float32(1.0) + np.float32(_PATCHY) * patch:
-                depth_mm[row, column] = 0
-                continue
-            error = rest * nodes[_DISPARITY, node] + share * nodes[_DISPARITY, node + 1]
-            step = math.floor(gain * nearness[v, u] + shared * error + own * _normal(state) + half)
-            depth_mm[row, column] = depths[step] if 0 <= step < len(depths) else 0
+            x = _next(x)
+            noise = _normal(x)
+            # A quarter pixel of the pixel's own noise breaks the smooth outline up.
+            shift_u = ragged * wobbles[_SHIFT_U, column] + np.float32(0.25) * noise
+            shift_v = ragged * wobbles[_SHIFT_V, column] + np.float32(0.25) * noise
+            u = min(max(column + _round(shift_u), 0), width - 1)
+            v = min(max(row + _round(shift_v), 0), height - 1)
+            step = _round(gain * nearness[v, u] + shared * errors[column] + own * noise)
+            seen = strength[v, u] >= one + patchy * wobbles[_LIGHT, u] and 0 <= step < len(depths)
+            depth_mm[row, column] = depths[step] if seen else 0
+
+
+@njit(cache=True, nogil=True)
+def _round(number):  # type: ignore[no-untyped-def]
+    # Truncation of a positive number is one instruction, floor is a call.
+    return np.int32(number + np.float32(1024.5)) - np.int32(1024)

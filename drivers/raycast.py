@@ -25,7 +25,8 @@ NEAREST_MM = 50.0
 """Nothing is seen closer to the camera than this."""
 
 _TORUS_STEPS = 64
-_TORUS_HIT_MM = 0.002
+_TORUS_HIT_MM = 0.005
+_TORUS_CLOSE = 0.02  # of the tube's radius: from there on one step of Newton's is exact enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,55 +283,68 @@ def _disc(centre, axis, size, stuff, lens, box, nearness, material):  # type: ig
 
 @njit(cache=True, nogil=True)
 def _torus(centre, axis, size, stuff, lens, box, nearness, material):  # type: ignore[no-untyped-def]
-    """Walk along the ray by the distance to the surface (sphere tracing, Hart 1996)."""
+    """Walk along the ray by the distance to the surface (sphere tracing, Hart 1996).
+
+    The last, slow part of the walk is one step of Newton's where the ray meets the surface at
+    more than 30 degrees.
+    """
     fx, fy, cx, cy = lens
     middle, tube = size[0], size[1]
     outer, inner = middle + tube, middle - tube
-    depth_of_axis = _dot(centre, axis)
-    power = _dot(centre, centre) - outer * outer
+    axial = _dot(centre, axis)
+    from_camera = _dot(centre, centre)
+    power = from_camera - outer * outer
     for row in range(box[0], box[1]):
         y = (row - cy) / fy
         for column in range(box[2], box[3]):
             x = (column - cx) / fx
-            length = math.sqrt(x * x + y * y + 1.0)
-            along = (x * centre[0] + y * centre[1] + centre[2]) / length
-            square = along * along - power
-            if square <= 0.0:
+            square_length = x * x + y * y + 1.0
+            along = x * centre[0] + y * centre[1] + centre[2]
+            if along * along <= power * square_length:
                 continue
+            length = math.sqrt(square_length)
+            along /= length
             # The walk is confined to the bounding sphere and to the slab of the tube.
-            begin, end = along - math.sqrt(square), along + math.sqrt(square)
+            half = math.sqrt(along * along - power)
+            begin, end = along - half, along + half
             slope = (x * axis[0] + y * axis[1] + axis[2]) / length
             if abs(slope) > 1e-9:
-                one, two = (depth_of_axis - tube) / slope, (depth_of_axis + tube) / slope
+                one, two = (axial - tube) / slope, (axial + tube) / slope
                 begin, end = max(begin, min(one, two)), min(end, max(one, two))
-            elif abs(depth_of_axis) > tube:
+            elif abs(axial) > tube:
                 continue
             begin = max(begin, NEAREST_MM * length)
             if begin >= end or nearness[row, column] * begin >= length:
                 continue
             # A ray that enters and leaves the slab inside the hole meets nothing.
-            rho_begin = _from_axis(begin, along, slope, depth_of_axis, centre)
-            if rho_begin < inner and _from_axis(end, along, slope, depth_of_axis, centre) < inner:
+            if (
+                _square_from_axis(begin, along, slope, axial, from_camera) < inner * inner
+                and _square_from_axis(end, along, slope, axial, from_camera) < inner * inner
+            ):
                 continue
             t = begin
             for _ in range(_TORUS_STEPS):
-                high = t * slope - depth_of_axis
-                out = _from_axis(t, along, slope, depth_of_axis, centre) - middle
-                gap = math.sqrt(out * out + high * high) - tube
-                if gap < _TORUS_HIT_MM:
-                    q = np.float32(length / t)
-                    if q > nearness[row, column]:
-                        nearness[row, column] = q
-                        material[row, column] = stuff
-                    break
+                high = t * slope - axial
+                square = _square_from_axis(t, along, slope, axial, from_camera)
+                rho = math.sqrt(max(square, 1e-12))
+                out = rho - middle
+                to_ring = math.sqrt(out * out + high * high)
+                gap = to_ring - tube
+                if gap < _TORUS_CLOSE * tube:
+                    closing = -(out * (t - along - high * slope) / rho + high * slope) / to_ring
+                    if closing > 0.5 or gap < _TORUS_HIT_MM:
+                        q = np.float32(length / (t + gap / max(closing, 0.5)))
+                        if q > nearness[row, column]:
+                            nearness[row, column] = q
+                            material[row, column] = stuff
+                        break
                 t += gap
                 if t > end:
                     break
 
 
 @njit(cache=True, nogil=True)
-def _from_axis(t, along, slope, depth_of_axis, centre):  # type: ignore[no-untyped-def]
-    """Distance of a ray's point from a torus' axis."""
-    high = t * slope - depth_of_axis
-    square = t * t - 2.0 * t * along + _dot(centre, centre) - high * high
-    return math.sqrt(max(square, 0.0))
+def _square_from_axis(t, along, slope, axial, from_camera):  # type: ignore[no-untyped-def]
+    """Squared distance of a ray's point from a torus' axis."""
+    high = t * slope - axial
+    return t * t - 2.0 * t * along + from_camera - high * high

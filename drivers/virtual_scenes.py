@@ -177,7 +177,7 @@ def _turn(yaw: float, pitch: float) -> npt.NDArray[np.float64]:
 def workstation() -> Scene:
     """A desk with two monitors, keyboard and shelf, a chair before it, a tower below."""
     b = _Builder()
-    floor, desk = 1000.0, 250.0
+    floor, desk = 1250.0, 500.0
     b.room(floor, 2600, -1900, 1700)
     # The desk: top, two side panels, a modesty panel, a pedestal with drawers.
     b.box(Material.WOOD, (0, desk + 15, 2150), (1700, 30, 800))
@@ -214,14 +214,14 @@ def workstation() -> Scene:
     b.sphere(Material.PAINT, (545, desk - 515, 2105), 62)
     b.rod(Material.METAL, (690, desk, 2250), (690, desk - 16, 2250), 85)
     # A shelf with books on the wall.
-    b.box(Material.WOOD, (-150, -420, 2480), (1300, 25, 240))
+    b.box(Material.WOOD, (-150, -220, 2480), (1300, 25, 240))
     at = -760.0
     for k in range(17):
         wide, high = 22 + 9 * (k * 5 % 4), 190 + 18 * (k * 7 % 5)
         slant = 0 if k % 6 else 5
-        b.box(Material.CLOTH, (at + wide / 2, -432 - high / 2, 2490 + slant), (wide, high, 170))
+        b.box(Material.CLOTH, (at + wide / 2, -232 - high / 2, 2490 + slant), (wide, high, 170))
         at += wide + (3 if k % 5 else 45)
-    b.box(Material.PAINT, (330, -530, 2490), (300, 190, 200), 10)
+    b.box(Material.PAINT, (330, -330, 2490), (300, 190, 200), 10)
     # An office chair, turned a little.
     turn = _turn(-28, 0)
     chair = np.array((430, floor, 1520.0))
@@ -241,19 +241,19 @@ def workstation() -> Scene:
         tip = (290 * math.cos(angle), 60, 290 * math.sin(angle))
         b.rod(Material.BLACK, on_chair(0, 95, 0), on_chair(*tip), 20, "round")
         b.sphere(Material.BLACK, on_chair(tip[0], 28, tip[2]), 28)
-    return Scene(b.shapes(), np.array((0, 130, 2100.0)), np.array((330, 130, 200.0)))
+    return Scene(b.shapes(), np.array((0, 310, 2050.0)), np.array((330, 130, 200.0)))
 
 
 def exercise_ball() -> Scene:
     """A large exercise ball on a mat before a wall with a door and a radiator."""
     b = _Builder()
-    floor = 900.0
-    b.room(floor, 3000, -2100, 2000)
-    b.box(Material.WALL, (-50, floor - 45, 2992), (4100, 90, 16))
-    b.box(Material.RUBBER, (60, floor - 6, 2050), (1700, 12, 800), 8)
-    b.sphere(Material.RUBBER, (0, floor - 12 - 325, 2050), 325)
-    b.rod(Material.BLACK, (0, floor - 12 - 325, 1722), (0, floor - 12 - 325, 1760), 11)
-    for x, z, yaw in ((-620, 1750, 35), (560, 1650, -60)):
+    floor = 1150.0
+    b.room(floor, 2550, -2100, 2000)
+    b.box(Material.WALL, (-50, floor - 45, 2542), (4100, 90, 16))
+    b.box(Material.RUBBER, (60, floor - 6, 1750), (1700, 12, 800), 8)
+    b.sphere(Material.RUBBER, (0, floor - 12 - 325, 1750), 325)
+    b.rod(Material.BLACK, (0, floor - 12 - 325, 1422), (0, floor - 12 - 325, 1460), 11)
+    for x, z, yaw in ((-560, 1500, 35), (520, 1420, -60)):
         turn = _turn(yaw, 0)
         grip = np.array((x, floor - 62, float(z)))
         b.rod(Material.METAL, _v(grip - turn[:, 0] * 75), _v(grip + turn[:, 0] * 75), 15)
@@ -261,23 +261,23 @@ def exercise_ball() -> Scene:
             inner, outer = grip + sign * turn[:, 0] * 70, grip + sign * turn[:, 0] * 135
             b.rod(Material.RUBBER, _v(inner), _v(outer), 52)
     # The door in its frame.
-    b.box(Material.WOOD, (-1150, floor - 1000, 2985), (800, 2000, 20))
-    for x in (-1590, -710):
-        b.box(Material.PAINT, (x, floor - 1040, 2980), (80, 2080, 50))
-    b.sphere(Material.METAL, (-800, floor - 1000, 2935), 28)
+    b.box(Material.WOOD, (-1050, floor - 1000, 2535), (800, 2000, 20))
+    for x in (-1490, -610):
+        b.box(Material.PAINT, (x, floor - 1040, 2530), (80, 2080, 50))
+    b.sphere(Material.METAL, (-700, floor - 1000, 2485), 28)
     # The radiator.
     for k in range(14):
-        x = 760 + 62 * k
-        b.rod(Material.PAINT, (x, floor - 120, 2900), (x, floor - 640, 2900), 24, "round")
+        x = 560 + 62 * k
+        b.rod(Material.PAINT, (x, floor - 120, 2460), (x, floor - 640, 2460), 24, "round")
     for y in (floor - 140, floor - 620):
-        b.rod(Material.PAINT, (740, y, 2915), (1600, y, 2915), 20)
-    return Scene(b.shapes(), np.array((0, 420, 2050.0)), np.array((420, 180, 260.0)))
+        b.rod(Material.PAINT, (540, y, 2472), (1400, y, 2472), 20)
+    return Scene(b.shapes(), np.array((40, 640, 1750.0)), np.array((380, 160, 200.0)))
 
 
 def fire_hose() -> Scene:
     """A fire-hose station: cabinet with a reel, valves and pipes before a flat wall."""
     b = _Builder()
-    floor, wall = 1100.0, 2350.0
+    floor, wall = 1100.0, 2100.0
     # The flat wall ends at a corridor, whose far end is the widest depth.
     b.quad(Material.FLOOR, (0, floor, 3000), (1, 0, 0), (0, 0, 1), 6000, 8000)
     b.quad(Material.WALL, (-950, -900, wall), (0, 1, 0), (1, 0, 0), 4000, 4000)
@@ -285,28 +285,27 @@ def fire_hose() -> Scene:
     b.quad(Material.WALL, (2300, -900, 4200), (0, 0, 1), (0, 1, 0), 6000, 4000)
     b.quad(Material.WALL, (1600, -900, 5700), (0, 1, 0), (1, 0, 0), 4000, 3000)
     # The cabinet: a shallow open box.
-    left, right, top, bottom, front = -330.0, 430.0, -330.0, 480.0, wall - 220
+    left, right, top, bottom = -330.0, 430.0, -330.0, 480.0
     for y in (top, bottom):
         b.box(Material.PAINT, ((left + right) / 2, y, wall - 110), (right - left + 24, 24, 220))
     for x in (left, right):
         b.box(Material.PAINT, (x, (top + bottom) / 2, wall - 110), (24, bottom - top, 220))
-    b.box(Material.PAINT, (left - 250, 75, front - 130), (16, 800, 560), -62)
     # The reel with its hose, the hub and the nozzle.
     hub = (50.0, 40.0, wall - 130)
-    for ring, middle in enumerate((150, 194, 238, 282)):
-        b.ring(Material.CLOTH, (hub[0], hub[1], hub[2] - 6 * (ring % 2)), (0, 0, 1), middle, 22)
+    for ring, middle in enumerate((160, 218, 276)):
+        b.ring(Material.CLOTH, (hub[0], hub[1], hub[2] - 8 * (ring % 2)), (0, 0, 1), middle, 29)
     b.rod(Material.PAINT, hub, (hub[0], hub[1], hub[2] - 60), 105)
     b.rod(Material.METAL, (hub[0], hub[1], hub[2] - 60), (hub[0], hub[1], hub[2] - 95), 34)
     b.chain(
         Material.CLOTH,
         [
-            (332, 40, hub[2]),
-            (338, 200, hub[2] - 25),
+            (326, 40, hub[2]),
+            (334, 200, hub[2] - 25),
             (300, 330, hub[2] - 60),
             (230, 400, hub[2] - 75),
             (140, 405, hub[2] - 80),
         ],
-        20,
+        29,
     )
     b.rod(Material.METAL, (140, 405, hub[2] - 80), (20, 395, hub[2] - 85), 16)
     b.rod(Material.METAL, (20, 395, hub[2] - 85), (-60, 388, hub[2] - 88), 25)
@@ -346,7 +345,7 @@ def fire_hose() -> Scene:
     b.rod(Material.METAL, (-900, 560, 1320), (-420, 585, 1290), 24, "round")
     for x, z in ((-840.0, 1316.0), (-470.0, 1293.0)):
         b.rod(Material.METAL, (x, 570, z), (x, floor, z), 20, "open")
-    return Scene(b.shapes(), np.array((30, 90, 2200.0)), np.array((340, 150, 220.0)))
+    return Scene(b.shapes(), np.array((40, 90, 2000.0)), np.array((340, 150, 200.0)))
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
