@@ -1,0 +1,191 @@
+"""Spending a budget of measurements over rounds, where the model is likely to be wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from selective_depth.selectors.reconstruct import reconstruct
+from selective_depth.selectors.scores import MISSED, Score, StepScore
+from selective_depth.selectors.seeds import SeedGrid
+
+Measure = Callable[[npt.NDArray[np.int32]], npt.NDArray[np.generic]]
+"""A random-access depth sensor: pixels (n, 2), column first, to depth (n,) in mm, 0 = none."""
+
+CROWDED = 0.3
+"""What a shot beside a better one is worth: it will mostly be told the same."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """What one round of an acquisition did.
+
+    Parameters
+    ----------
+    shots : int
+        Measurements made.
+    returned : int
+        Those that returned depth.
+    """
+
+    shots: int
+    returned: int
+
+
+@dataclass(frozen=True, eq=False)
+class Acquisition:
+    """The multi-resolution model: the seeds and every shot added to them.
+
+    Parameters
+    ----------
+    uv : int32 array of shape (n, 2)
+        Pixels measured, column first, in the order of measuring; seeds first.
+    depth_mm : uint16 array of shape (n,)
+        Depth; 0 = no return (kept: it was paid for, and it marks a hole).
+    round : uint8 array of shape (n,)
+        Round in which each was measured, 0 = seed.
+    frame_shape : tuple of int
+        Height and width of the frame in pixels.
+    rounds : tuple of Round
+        Summary of each round after the seeds.
+    """
+
+    uv: npt.NDArray[np.int32]
+    depth_mm: npt.NDArray[np.uint16]
+    round: npt.NDArray[np.uint8]
+    frame_shape: tuple[int, int]
+    rounds: tuple[Round, ...]
+
+    @property
+    def returned(self) -> npt.NDArray[np.bool_]:
+        """Which measurements returned depth, shape (n,)."""
+        return self.depth_mm > 0
+
+    def round_image(self) -> npt.NDArray[np.uint8]:
+        """Round in which each pixel was measured, plus one; 0 = never; shape (H, W)."""
+        image = np.zeros(self.frame_shape, np.uint8)
+        image[self.uv[:, 1], self.uv[:, 0]] = self.round + 1
+        return image
+
+    def mask(self, number: int | None = None) -> npt.NDArray[np.bool_]:
+        """Pixels shot in a round (0 = the seeds), or in all rounds after the seeds."""
+        chosen = self.round > 0 if number is None else self.round == number
+        mask = np.zeros(self.frame_shape, np.bool_)
+        mask[self.uv[chosen, 1], self.uv[chosen, 0]] = True
+        return mask
+
+    def reconstruct(self, threads: int | None = None) -> npt.NDArray[np.float32]:
+        """Dense depth of the model in millimetres, shape (H, W)."""
+        return reconstruct(self.uv, self.depth_mm, self.frame_shape, threads=threads)
+
+
+def shots_of(budget: float, shape: tuple[int, int]) -> int:
+    """Number of measurements in a budget: an int is a number, a float a share of the pixels."""
+    pixels = shape[0] * shape[1]
+    shots = budget if isinstance(budget, int) else round(budget * pixels)
+    if not 0 <= shots <= pixels:
+        raise ValueError(
+            f"a budget of {budget} is {shots} of {pixels} pixels; give a share from 0.0 to 1.0,"
+            " or a whole number of measurements"
+        )
+    return int(shots)
+
+
+def choose(
+    score: npt.NDArray[np.float32], shots: int, crowded: float = CROWDED
+) -> npt.NDArray[np.int32]:
+    """Pixels to measure: the best scores, after those beside a better one are marked down.
+
+    Parameters
+    ----------
+    score : float32 array of shape (H, W)
+        Worth of a shot; pixels with 0 are never chosen.
+    shots : int
+        How many at most.
+    crowded : float, default `CROWDED`
+        Factor on pixels that are no maximum of their 3x3 neighbourhood.
+
+    Returns
+    -------
+    int32 array of shape (n, 2)
+        Column first, best first; n <= shots.
+    """
+    import cv2
+
+    peak = score >= cv2.dilate(score, np.ones((3, 3), np.uint8))
+    worth = np.where(peak, score, score * np.float32(crowded)).ravel()
+    shots = min(shots, int(np.count_nonzero(worth > 0)))
+    if shots == 0:
+        return np.empty((0, 2), np.int32)
+    best = np.argpartition(-worth, shots - 1)[:shots]
+    best = best[np.lexsort((best, -worth[best]))]
+    return np.stack((best % score.shape[1], best // score.shape[1]), axis=-1).astype(np.int32)
+
+
+def acquire(
+    measure: Measure,
+    seeds: SeedGrid,
+    budget: float = 0.05,
+    rounds: int = 8,
+    selector: Score | None = None,
+    *,
+    threads: int | None = None,
+) -> Acquisition:
+    """Measure where the model is likely to be wrong, round by round.
+
+    Parameters
+    ----------
+    measure : callable
+        The sensor: pixels (n, 2), column first, to depth (n,) in millimetres, 0 = no return.
+        It is asked for nothing but the chosen pixels, each at most once.
+    seeds : SeedGrid
+        The first measurements; they are not part of the budget.
+    budget : float or int, default 0.05
+        Float: share of the frame's pixels. Int: number of measurements. A measurement that
+        returns nothing is paid for as well.
+    rounds : int, default 8
+        In how many rounds; 1 decides everything from the seeds.
+    selector : Score, optional
+        What a shot is worth; default `StepScore`.
+    threads : int, optional
+        Kernel threads; default `default_threads()`.
+
+    Returns
+    -------
+    Acquisition
+        Seeds and shots. It may hold fewer shots than the budget, if there was nothing left
+        near any sample.
+    """
+    if rounds < 1:
+        raise ValueError(f"{rounds} rounds were asked for; at least 1 is needed")
+    score = StepScore() if selector is None else selector
+    shots = shots_of(budget, seeds.frame_shape)
+    samples_mm = np.zeros(seeds.frame_shape, np.float32)
+    lattice_uv = seeds.lattice_uv.reshape(-1, 2)
+    lattice_mm = seeds.depth_mm.ravel()
+    samples_mm[lattice_uv[:, 1], lattice_uv[:, 0]] = np.where(lattice_mm > 0, lattice_mm, MISSED)
+    uv, depth, made = [lattice_uv], [lattice_mm.astype(np.uint16)], []
+    for number in range(rounds):
+        due = shots * (number + 1) // rounds - sum(r.shots for r in made)
+        new_uv = choose(score.map(samples_mm, threads), due)
+        new_mm = np.asarray(measure(new_uv))
+        if new_mm.shape != (len(new_uv),):
+            raise ValueError(
+                f"the sensor was asked for {len(new_uv)} pixels and answered with shape"
+                f" {new_mm.shape}; it must return one depth per pixel"
+            )
+        samples_mm[new_uv[:, 1], new_uv[:, 0]] = np.where(new_mm > 0, new_mm, MISSED)
+        uv.append(new_uv)
+        depth.append(new_mm.astype(np.uint16))
+        made.append(Round(len(new_uv), int(np.count_nonzero(new_mm))))
+    counts = [len(part) for part in uv]
+    return Acquisition(
+        np.concatenate(uv),
+        np.concatenate(depth),
+        np.repeat(np.arange(len(uv), dtype=np.uint8), counts),
+        seeds.frame_shape,
+        tuple(made),
+    )
