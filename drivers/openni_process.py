@@ -135,6 +135,7 @@ class Worker:
             self._process.kill()
             self._process.wait()
         self._reader.join()
+        self._memory.close()
 
     def _tell(self, line: str) -> None:
         # A worker that died is noticed by its last message, not here.

@@ -8,10 +8,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from selective_depth.drivers.oni_file import inspect_oni
 from selective_depth.drivers.openni_device import DeviceSettings
 from selective_depth.drivers.openni_process import Worker, error_of
 from selective_depth.drivers.openni_replay import OpenNIRecording
-from selective_depth.drivers.source import DeviceRefusedError, SourceError, SourceNotFoundError
+from selective_depth.drivers.source import SourceError, SourceNotFoundError
 
 _OPEN_S = 10.0
 _STALL_S = 5.0  # silence of the sensor after which a recording is ended
@@ -100,7 +101,7 @@ def record(
             stall_s=_STALL_S,
         )
         try:
-            ended = _follow(worker, progress)
+            ended, seen = _follow(worker, progress)
         finally:
             worker.close(grace_s=1.0)
     except BaseException:
@@ -110,7 +111,7 @@ def record(
     finally:
         os.close(file)
     seconds = time.monotonic() - started
-    counted, problem = _verify(path)
+    counted, problem = _verify(path, seen)
     return RecordingReport(path, counted, seconds, ended, problem)
 
 
@@ -127,25 +128,27 @@ def _create(path: Path, overwrite: bool) -> int:
         ) from error
 
 
-def _follow(worker: Worker, progress: Callable[[int], None] | None) -> str:
-    """Wait until the file is saved; say what ended it."""
+def _follow(worker: Worker, progress: Callable[[int], None] | None) -> tuple[str, int]:
+    """Wait until the file is saved; say what ended it and how many frames were seen."""
     interrupted = False
     patience_s = _OPEN_S
+    seen = 0
     while True:
         try:
             message = worker.receive(patience_s)
             if message is None:
-                raise DeviceRefusedError(f"OpenNI2 hangs for {patience_s:g} s while recording.")
+                return f"OpenNI2 hangs for {patience_s:g} s", seen
             if message["kind"] == "error":
                 raise error_of(message)
             if message["kind"] == "died":
-                return str(message["reason"])
+                return str(message["reason"]), seen
             if message["kind"] == "saved":
-                return "interrupted" if interrupted else str(message["ended"])
-            if message["kind"] in ("opened", "recorded"):
-                patience_s = _SAVE_S if interrupted else _HANG_S
-            if message["kind"] == "recorded" and progress is not None:
-                progress(message["frames"])
+                return "interrupted" if interrupted else str(message["ended"]), seen
+            patience_s = _SAVE_S if interrupted else _HANG_S
+            if message["kind"] == "recorded":
+                seen = int(message["frames"])
+                if progress is not None:
+                    progress(seen)
         except KeyboardInterrupt:
             if interrupted:
                 raise
@@ -154,13 +157,23 @@ def _follow(worker: Worker, progress: Callable[[int], None] | None) -> str:
             worker.stop()
 
 
-def _verify(path: Path) -> tuple[int, str]:
-    """Open a recording again and count its frames."""
-    frames = 0
+def _verify(path: Path, seen: int) -> tuple[int, str]:
+    """Count the frames of a finished recording, and have OpenNI2 itself open it again."""
+    report = inspect_oni(path)
+    frames = report.readable_frames
+    if not report.complete:
+        what = f" ({report.problems[0].sentence.rstrip('.')})" if report.problems else ""
+        return frames, (
+            f"'{path}' was not written to its end{what}. `selective-depth check '{path}' --repair"
+            f" OUT.oni` saves its {frames} frames."
+        )
+    # The recorder leaves as many zeros after the end as there are bytes before it.
+    os.truncate(path, report.size_bytes - report.tail_bytes)
     try:
         with OpenNIRecording(path) as recording:
-            for _ in recording:
-                frames += 1
+            declared = recording.frame_count
     except SourceError as error:
-        return frames, str(error)
+        return frames, f"OpenNI2 does not open the recording again: {error}"
+    if frames < seen or frames != declared:
+        return frames, f"'{path}' has {frames} frames and says {declared}; the sensor made {seen}."
     return frames, ""

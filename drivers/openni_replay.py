@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TypeVar
 
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.oni_file import inspect_oni
 from selective_depth.drivers.openni_process import Message, Worker, error_of
 from selective_depth.drivers.source import (
     DamagedRecordingError,
     DepthSource,
     SourceEndedError,
-    SourceNotFoundError,
     SourceTimeoutError,
 )
 
@@ -48,8 +48,8 @@ class OpenNIRecording(DepthSource):
 
     def __init__(self, path: str | Path) -> None:
         self.uri = str(path)
-        _check_file(Path(path))
-        self._worker: Worker | None = Worker("recording", path=self.uri)
+        readable, self._flaw = _readable_frames(self.uri)
+        self._worker: Worker | None = Worker("recording", path=self.uri, readable=readable)
         self._read_count = 0
         self._ended: SourceEndedError | DamagedRecordingError | None = None
         try:
@@ -100,6 +100,12 @@ class OpenNIRecording(DepthSource):
                 )
             )
         self._heard = time.monotonic()
+        if message["kind"] == "end" and self._flaw:
+            raise self._over(
+                DamagedRecordingError(
+                    f"'{self.uri}' cannot be read beyond frame {self._read_count}: {self._flaw}"
+                )
+            )
         if message["kind"] == "end":
             raise self._over(
                 SourceEndedError(f"'{self.uri}' has ended after {self._read_count} frames.")
@@ -141,7 +147,16 @@ class OpenNIRecording(DepthSource):
         return error
 
 
-def _check_file(path: Path) -> None:
-    """Refuse what OpenNI2 would answer with a crash."""
-    if not path.exists():
-        raise SourceNotFoundError(f"'{path}' does not exist.")
+def _readable_frames(path: str) -> tuple[int, str]:
+    """How many frames a recording has, and what is harmlessly wrong with it.
+
+    What OpenNI2 would answer with a crash is refused.
+    """
+    report = inspect_oni(path)
+    advice = f"`selective-depth check '{path}'` says more and saves what is readable."
+    if not report.openable:
+        wrong = [problem for problem in report.problems if not problem.harmless]
+        what = f"{wrong[0]}" if wrong else "it holds no depth frame"
+        raise DamagedRecordingError(f"'{path}' is no whole recording: {what.rstrip('.')}. {advice}")
+    flaw = f"{report.problems[0]}".rstrip(".") + f". {advice}" if report.problems else ""
+    return report.readable_frames, flaw

@@ -416,7 +416,7 @@ def run_recording(job: dict[str, Any], parent: Parent) -> None:
     if stream is None:
         raise damaged("holds no depth stream")
     about = describe(stream)
-    count = stream.get_number_of_frames()
+    count = min(stream.get_number_of_frames(), job["readable"])
     width, height = about["width"], about["height"]
     if count < 1:
         raise damaged("was not closed when it was recorded: it does not say how many frames it has")

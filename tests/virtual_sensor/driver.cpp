@@ -164,10 +164,10 @@ public:
 
 private:
     void load_frames() {
-        std::ifstream file(control().text("frames"), std::ios::binary);
-        std::vector<char> bytes{std::istreambuf_iterator<char>(file), {}};
-        frames_.resize(bytes.size() / 2);
-        std::memcpy(frames_.data(), bytes.data(), frames_.size() * 2);
+        std::ifstream file(control().text("frames"), std::ios::binary | std::ios::ate);
+        frames_.resize(file ? size_t(file.tellg()) / 2 : 0);
+        file.seekg(0);
+        file.read(reinterpret_cast<char*>(frames_.data()), std::streamsize(frames_.size() * 2));
     }
 
     void run() {
