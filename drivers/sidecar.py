@@ -102,8 +102,8 @@ def write_sidecar(folder: Path, sidecar: Sidecar) -> None:
     for name, value in vars(sidecar).items():
         if isinstance(value, tuple):
             lines.append(f"{name} = {list(value)}")
-        elif isinstance(value, float):
-            lines.append(f"{name} = {value!r}")
+        elif isinstance(value, int | float):
+            lines.append(f"{name} = {float(value)!r}")
     if sidecar.camera is not None:
         lines.append("\n[camera]")
         lines.extend(f"{key} = {getattr(sidecar.camera, key)!r}" for key in _CAMERA_KEYS)
