@@ -11,9 +11,5 @@ class UsageError(AppError):
     """The command was typed wrongly."""
 
 
-class OutputError(AppError):
-    """A result cannot be written."""
-
-
 class ViewerError(AppError):
     """The viewer cannot be reached or started."""

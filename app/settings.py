@@ -82,8 +82,14 @@ class ViewerOptions:
     """Where to serve it; the default lets only this machine in."""
     connect: Annotated[str | None, arg(metavar="URL")] = None
     """Send to a viewer that is already open, for example rerun+http://127.0.0.1:9876/proxy."""
-    memory_limit: Annotated[str, arg(metavar="SIZE")] = "1GiB"
-    """Memory that the viewer window or the served stream may keep; then the oldest goes."""
+    serve_memory: Annotated[str, arg(metavar="SIZE")] = "256MiB"
+    """Memory of the served stream, for viewers that join late; then the oldest goes."""
+    viewer_memory: Annotated[str, arg(metavar="SIZE")] = "2GiB"
+    """Memory of the viewer window; then the oldest goes."""
+    near_mm: Annotated[int, arg(metavar="MM")] = 500
+    """Depth at the dark end of the colour scale; fixed, so that colours never jump."""
+    far_mm: Annotated[int, arg(metavar="MM")] = 5000
+    """Depth at the bright end of the colour scale."""
     detail: bool = False
     """Show the kriging estimate, its variance and the long-edge triangles too."""
 

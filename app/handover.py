@@ -1,0 +1,137 @@
+"""Handing results to something slow, which must never hold up the one who hands them over."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Generic, Protocol, TypeVar
+
+T = TypeVar("T")
+Taken = TypeVar("Taken", contravariant=True)
+
+
+class Sink(Protocol[Taken]):
+    """Where results go. All of it is called by one and the same thread."""
+
+    def open(self) -> None:
+        """Get ready; may take its time."""
+
+    def put(self, item: Taken, /) -> None:
+        """Take one result; may block for as long as it likes."""
+
+    def close(self) -> None:
+        """Finish and let go."""
+
+
+class Handover(Generic[T]):
+    """A worker thread that feeds a sink from a short queue.
+
+    A lossless hand-over waits for room, so that every item arrives. Any other waits at most
+    `patience_s` for a sink that is merely slow and not at all for one that has stalled: then
+    the oldest item goes, counted in `dropped`.
+
+    Parameters
+    ----------
+    name : str
+        Name of the sink, for its thread and for messages.
+    sink : Sink
+        Where items go.
+    lossless : bool
+        Whether every item must arrive.
+    patience_s : float, default 0
+        Longest wait for room, in seconds, before an item is dropped.
+    capacity : int, default 2
+        Items that may wait.
+
+    Attributes
+    ----------
+    dropped : int
+        Items that never reached the sink.
+    failure : Exception or None
+        What ended the sink before its time; nothing is taken any more.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        sink: Sink[T],
+        *,
+        lossless: bool,
+        patience_s: float = 0.0,
+        capacity: int = 2,
+    ) -> None:
+        self.name = name
+        self.dropped = 0
+        self.failure: Exception | None = None
+        self._sink = sink
+        self._lossless = lossless
+        self._patience_s = patience_s
+        self._capacity = capacity
+        self._queue: deque[T] = deque()
+        self._changed = threading.Condition()
+        self._finishing = False
+        self._stalled = False
+        self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
+        self._thread.start()
+
+    def offer(self, item: T) -> None:
+        """Hand over an item."""
+        with self._changed:
+            if self._lossless:
+                # Waits in short turns: Ctrl-C must get through on every platform.
+                while self._full():
+                    self._changed.wait(0.2)
+            elif self._full() and not self._stalled:
+                self._stalled = not self._changed.wait_for(
+                    lambda: not self._full(), self._patience_s
+                )
+            if self.failure is not None:
+                self.dropped += 1
+                return
+            if self._full():
+                self._queue.popleft()
+                self.dropped += 1
+            self._queue.append(item)
+            self._changed.notify_all()
+
+    def finish(self, timeout_s: float) -> bool:
+        """Let the sink take what is waiting, and close it.
+
+        Returns
+        -------
+        bool
+            False if it did not end in time. It is then left behind in its thread, which
+            does not keep the process alive.
+        """
+        with self._changed:
+            self._finishing = True
+            self._changed.notify_all()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            self.dropped += len(self._queue)
+            return False
+        return True
+
+    def _full(self) -> bool:
+        return self.failure is None and len(self._queue) >= self._capacity
+
+    def _serve(self) -> None:
+        try:
+            self._sink.open()
+            while (item := self._next()) is not None:
+                self._sink.put(item)
+            self._sink.close()
+        except Exception as error:  # noqa: BLE001 - whoever hands over must hear of it
+            with self._changed:
+                self.failure = error
+                self.dropped += len(self._queue)
+                self._queue.clear()
+                self._changed.notify_all()
+
+    def _next(self) -> T | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._queue or self._finishing)
+            self._stalled = False
+            item = self._queue.popleft() if self._queue else None
+            self._changed.notify_all()
+            return item

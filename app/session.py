@@ -1,0 +1,215 @@
+"""A run from its source to its report: where source, loop and viewer meet."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+from selective_depth.app.errors import UsageError
+from selective_depth.app.loop import Loop
+from selective_depth.app.progress import FrameProgress, waiting
+from selective_depth.app.realtime import RealtimeSource
+from selective_depth.app.report import RunReport, count_samples, print_report, save_settings, say
+from selective_depth.app.settings import Settings, ViewerOptions
+from selective_depth.app.step import StateNote, Step
+from selective_depth.app.viewer import Viewer, has_display
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.source import (
+    DamagedRecordingError,
+    DepthSource,
+    DeviceLostError,
+    SourceEndedError,
+    SourceTimeoutError,
+    open_source,
+)
+
+OK, FAILED, INTERRUPTED = 0, 1, 130
+POLL_S = 0.5
+"""How long a live sensor may be silent before its state is shown."""
+
+
+def watch(uri: str, settings: Settings) -> int:
+    """Run a source through both selectors into the viewer, and print what it came to.
+
+    Parameters
+    ----------
+    uri : str
+        As for `open_source`.
+    settings : Settings
+        All options.
+
+    Returns
+    -------
+    int
+        Exit code: 0, 1 if something that was asked for failed, 130 after Ctrl-C.
+    """
+    check(settings)
+    settings = dataclasses.replace(settings, viewer=_with_a_place(settings.viewer, uri))
+    session = Session(uri, settings)
+    code = session.run()
+    print_report(session.report)
+    return code
+
+
+def check(settings: Settings) -> None:
+    """Refuse options that contradict each other or lie outside their range.
+
+    Raises
+    ------
+    UsageError
+        Naming the option, its value and what is allowed.
+    """
+    run, spend, seen = settings.run, settings.acquire, settings.viewer
+    for option, value, allowed, good in (
+        ("--frames", run.frames, "1 or more", run.frames is None or run.frames >= 1),
+        ("--budget", spend.budget, "a share between 0 and 1", 0 <= spend.budget <= 1),
+        ("--rounds", spend.rounds, "between 1 and 255", 1 <= spend.rounds <= 255),
+        ("--near-mm", seen.near_mm, "0 or more", seen.near_mm >= 0),
+        ("--far-mm", seen.far_mm, "more than --near-mm", seen.far_mm > seen.near_mm),
+    ):
+        if not good:
+            raise UsageError(f"{option} is {value}; it must be {allowed}.")
+
+
+def _with_a_place(options: ViewerOptions, uri: str) -> ViewerOptions:
+    """Save to a file where nothing else was asked for and no window can be opened."""
+    asked = options.save or options.serve or options.connect or options.headless
+    if asked or has_display():
+        return options
+    name = Path(uri.partition("?")[0].replace("virtual:", "").rstrip("/\\")).stem or "depth"
+    path = Path(f"{name.replace(':', '-')}.rrd")
+    say(f"No display here: saving to {path} instead; open it with 'rerun {path}'.")
+    return dataclasses.replace(options, save=path)
+
+
+class Session:
+    """One run.
+
+    Parameters
+    ----------
+    uri : str
+        As for `open_source`.
+    settings : Settings
+        All options, checked.
+
+    Attributes
+    ----------
+    report : RunReport
+        What it has come to.
+    last : Step or None
+        The last step.
+    """
+
+    def __init__(self, uri: str, settings: Settings) -> None:
+        self.settings = settings
+        self.report = RunReport(uri, live=False)
+        self._uri = uri
+        self.last: Step | None = None
+
+    def run(self) -> int:
+        """Run to the end of the source, the asked number of frames, or Ctrl-C.
+
+        Returns
+        -------
+        int
+            Exit code, as for `watch`.
+        """
+        settings, report = self.settings, self.report
+        with ExitStack() as stack:
+            with waiting(f"Opening {self._uri}"):
+                source = stack.enter_context(open_source(self._uri))
+            if settings.run.realtime and not source.live:
+                source = stack.enter_context(RealtimeSource(source))
+            report.live = source.live
+            loop = stack.enter_context(Loop(settings, every_model=not source.live))
+            acquiring = settings.acquire.budget > 0
+            viewer = Viewer(
+                settings.viewer, acquiring=acquiring, live=source.live, times=loop.times
+            )
+            try:
+                self._turn_all(source, loop, viewer)
+                code = OK
+            except KeyboardInterrupt:
+                code = INTERRUPTED
+            except DamagedRecordingError as error:
+                report.troubles.append(str(error))
+                code = FAILED
+            finally:
+                report.troubles += viewer.close()
+                report.missed = viewer.dropped
+                report.dropped = source.dropped
+                report.stages = loop.times.summary()
+        self._write_beside()
+        return code
+
+    def _turn_all(self, source: DepthSource, loop: Loop, viewer: Viewer) -> None:
+        limit, count = self.settings.run.frames, source.frame_count
+        total = min(limit or count or 0, count or limit or 0) or None
+        start_s = time.monotonic()
+        recent = deque([start_s], maxlen=31)
+        with FrameProgress(self._uri, total) as progress:
+            for frame in self._frames(source, loop, viewer, progress):
+                if self.report.frames == 0:
+                    with waiting("Compiling for this machine; the next run starts at once"):
+                        loop.warm_up(frame)
+                    start_s = recent[0] = time.monotonic()
+                step = loop.turn(frame, _state(source))
+                recent.append(time.monotonic())
+                fps = (len(recent) - 1) / (recent[-1] - recent[0])
+                self._show(step, fps, source, loop, viewer)
+                self.report.seconds = time.monotonic() - start_s
+                progress.update(self.report.frames, f"{fps:.0f} frames/s")
+                if self.report.frames == limit:
+                    return
+
+    def _frames(
+        self, source: DepthSource, loop: Loop, viewer: Viewer, progress: FrameProgress
+    ) -> Iterator[DepthFrame]:
+        """All frames; a live source that has none shows its state meanwhile."""
+        while True:
+            try:
+                with loop.times.stage("read"):
+                    frame = source.read(POLL_S) if source.live else source.read()
+            except SourceEndedError:
+                return
+            except (SourceTimeoutError, DeviceLostError):
+                if not source.live:
+                    raise
+                viewer.show(StateNote(_state(source)))
+                progress.update(self.report.frames, f"sensor {_state(source)}")
+            else:
+                yield frame
+
+    def _show(
+        self, step: Step, fps: float, source: DepthSource, loop: Loop, viewer: Viewer
+    ) -> None:
+        self.report.take(step)
+        self.last = step
+        figures = {
+            "fps": fps,
+            "dropped_sensor": source.dropped,
+            "dropped_viewer": sum(viewer.dropped.values()),
+            "samples": count_samples(step),
+            "quantisation_error_mm": step.regions.quantisation_error_mm,
+        }
+        if step.model is not None:
+            figures["rmse_mm"] = step.model.rmse_mm
+        viewer.show(dataclasses.replace(step, stages_ms=loop.times.last_ms(), figures=figures))
+
+    def _write_beside(self) -> None:
+        """Settings and, where nothing was seen live, a picture, beside the file saved."""
+        path = self.settings.viewer.save
+        if path is None or self.report.frames == 0:
+            return
+        self.report.written.append(path)
+        settings_path = path.with_suffix(".toml")
+        save_settings(settings_path, self.settings, self._uri)
+        self.report.written.append(settings_path)
+
+
+def _state(source: DepthSource) -> str:
+    return "replay" if source.frame_count is not None else source.state

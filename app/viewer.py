@@ -1,0 +1,660 @@
+"""Everything in Rerun: what is logged, how it is laid out, and where it goes."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import shutil
+import socket
+import sys
+import time
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+import rerun.blueprint as rrb
+
+from selective_depth.app import legend
+from selective_depth.app.errors import ViewerError
+from selective_depth.app.handover import Handover
+from selective_depth.app.settings import ViewerOptions
+from selective_depth.app.step import StateNote, Step
+from selective_depth.app.timing import StageTimes
+from selective_depth.drivers.source import OutputError
+
+APPLICATION = "selective-depth"
+VIEWER_PORT = 9876
+PROBE_S = 0.3
+"""How long an address is tried. Where no viewer listens the SDK itself would block for 5 s
+and lose what is logged."""
+CHECK_EVERY_S = 1.0
+SPARE_BYTES = 64 << 20
+"""Saving ends, with a whole file, when the disk has less room than this."""
+STALL_S = 0.5
+"""A viewer that takes longer over a step has stalled; a recording waits no more."""
+FILE_QUEUE = 8
+EXIT_S = 1.0
+"""How long a sink may take over its last frames."""
+
+DEPTH_COLOURS = legend.palette(cv2.COLORMAP_VIRIDIS)
+CENTRE = np.float32(0.5)
+"""Rerun puts pixel centres at halves, we at whole numbers."""
+
+
+# What is logged
+
+
+class StepLogger:
+    """Logs steps into one recording stream, from one thread.
+
+    Parameters
+    ----------
+    stream : rr.RecordingStream
+        Where to.
+    options : ViewerOptions
+        What the user asked to see.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, options: ViewerOptions) -> None:
+        self._stream = stream
+        self._options = options
+        self._start_us: int | None = None
+        self._state = ""
+        self._stages: list[str] = []
+
+    def log(self, step: Step) -> None:
+        """Log a step under its frame's number and time."""
+        if self._start_us is None:
+            self._start_us = step.frame.timestamp_us
+            self._log_static(step)
+        self._stream.set_time("frame", sequence=step.frame.index)
+        elapsed_us = step.frame.timestamp_us - self._start_us
+        self._stream.set_time("time", duration=elapsed_us / 1e6)
+        self._log_sensor(step)
+        self._log_gas(step)
+        self._log_improvement(step)
+        self._log_acquisition(step)
+        self._log_figures(step)
+
+    def log_state(self, state: str) -> None:
+        """Log the sensor's state, if it has changed, under the time of the last step."""
+        if state != self._state and self._start_us is not None:
+            self._state = state
+            self._stream.log("sensor/state", rr.StateChange(state=state))
+
+    def _log_static(self, step: Step) -> None:
+        camera, log = step.frame.camera, self._stream.log
+        self._stream.send_recording_name(step.frame.source or "depth")
+        log("/", rr.ViewCoordinates.RDF, static=True)
+        pinhole = rr.Pinhole(
+            resolution=[camera.width, camera.height],
+            focal_length=[camera.fx, camera.fy],
+            principal_point=[camera.cx + CENTRE, camera.cy + CENTRE],
+            image_plane_distance=0.3,
+        )
+        log("camera", pinhole, static=True)
+        for path, label, colour in (
+            ("camera/holes", "no measurement", legend.HOLE),
+            ("camera/improvement/unknown", "too far from any sample", legend.HOLE),
+            ("camera/gas/mask", "kept triangles", legend.REGION),
+            ("camera/gas/complement", "long-edge triangles", legend.LONG_EDGE),
+        ):
+            classes = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, label, colour)])
+            log(path, classes, static=True)
+        log("guide", rr.TextDocument(legend.HOW_TO_READ, media_type="text/markdown"), static=True)
+        states = rr.StateConfiguration(
+            values=list(legend.STATE_COLOURS),
+            labels=list(legend.STATE_COLOURS),
+            colors=list(legend.STATE_COLOURS.values()),
+        )
+        log("sensor/state", states, static=True)
+        for name, label in legend.FIGURES.items():
+            log(f"figures/{name}", rr.SeriesLines(names=label), static=True)
+
+    def _log_sensor(self, step: Step) -> None:
+        log, depth_mm, seeds = self._stream.log, step.frame.depth_mm, step.seeds
+        log("camera/depth", self._depth_image(depth_mm))
+        log("camera/holes", rr.SegmentationImage((depth_mm == 0).view(np.uint8)))
+        near, far = self._options.near_mm, self._options.far_mm
+        level = np.clip((seeds.depth_mm.ravel() - near) * (255 / (far - near)), 0, 255)
+        colours = np.where(
+            seeds.valid.ravel(), DEPTH_COLOURS[level.astype(np.uint8)], np.uint32(legend.HOLE)
+        )
+        positions = seeds.lattice_uv.reshape(-1, 2) + CENTRE
+        log("camera/seeds", rr.Points2D(positions, colors=colours, radii=0.9))
+        self.log_state(step.state)
+
+    def _log_gas(self, step: Step) -> None:
+        log, regions = self._stream.log, step.regions
+        log("camera/gas/mask", rr.SegmentationImage(regions.mask.view(np.uint8)))
+        if self._options.detail:
+            complement = rr.SegmentationImage(regions.complement.view(np.uint8))
+            log("camera/gas/complement", complement)
+        nodes_uv, kept = regions.nodes_uv + CENTRE, regions.triangles[regions.kept]
+        outlines = nodes_uv[kept[:, (0, 1, 2, 0)]]
+        log("camera/gas/triangles", rr.LineStrips2D(outlines, colors=legend.MESH, radii=0.35))
+        log("camera/gas/nodes", rr.Points2D(nodes_uv, colors=legend.NODE, radii=1.4))
+        nodes_m = regions.nodes_mm * np.float32(0.001)
+        log("world/nodes", rr.Points3D(nodes_m, colors=legend.NODE, radii=-1.5))
+        mesh = rr.Mesh3D(
+            vertex_positions=nodes_m, triangle_indices=kept, albedo_factor=legend.REGION
+        )
+        log("world/regions", mesh)
+
+    def _log_improvement(self, step: Step) -> None:
+        log, improvement = self._stream.log, step.improvement
+        known = improvement.known
+        log("camera/improvement/score", _map_image(improvement.score, 1.0, known))
+        log("camera/improvement/unknown", rr.SegmentationImage((~known).view(np.uint8)))
+        if self._options.detail:
+            log(
+                "camera/improvement/estimate", self._depth_image(_as_depth(improvement.estimate_mm))
+            )
+            deviation_mm = np.sqrt(np.where(known, improvement.variance_mm2, 0))
+            image = _map_image(deviation_mm, legend.ERROR_LIMIT_MM, known)
+            log("camera/improvement/deviation", image)
+
+    def _log_acquisition(self, step: Step) -> None:
+        log, acquisition = self._stream.log, step.acquisition
+        if acquisition is None:
+            return
+        shot = acquisition.round > 0
+        uv, depth_mm, rounds = (
+            array[shot] for array in (acquisition.uv, acquisition.depth_mm, acquisition.round)
+        )
+        colours = legend.round_colours(int(rounds.max(initial=0)))[rounds]
+        log("camera/samples", rr.Points2D(uv + CENTRE, colors=colours, radii=0.9))
+        hit = depth_mm > 0
+        points_m = step.frame.camera.points_mm(uv[hit], depth_mm[hit]) * np.float32(0.001)
+        log("world/samples", rr.Points3D(points_m, colors=colours[hit], radii=-1.5))
+        if step.model is not None:
+            log("camera/model", self._depth_image(_as_depth(step.model.depth_mm)))
+            error_mm = step.model.error_mm
+            known = ~np.isnan(error_mm)
+            log("camera/error", _map_image(error_mm, legend.ERROR_LIMIT_MM, known))
+
+    def _log_figures(self, step: Step) -> None:
+        log = self._stream.log
+        if list(step.stages_ms) != self._stages:
+            self._stages = list(step.stages_ms)
+            log("figures/stages", rr.SeriesLines(names=self._stages), static=True)
+        log("figures/stages", rr.Scalars(list(step.stages_ms.values())))
+        for name, value in step.figures.items():
+            if np.isfinite(value):
+                log(f"figures/{name}", rr.Scalars(value))
+
+    def _depth_image(self, depth_mm: npt.NDArray[np.uint16]) -> rr.DepthImage:
+        limits = [float(self._options.near_mm), float(self._options.far_mm)]
+        return rr.DepthImage(depth_mm, meter=1000.0, colormap="viridis", depth_range=limits)
+
+
+def _as_depth(value_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
+    return np.nan_to_num(value_mm).clip(0, 65535).astype(np.uint16)
+
+
+def _map_image(
+    value: npt.NDArray[np.float32], limit: float, known: npt.NDArray[np.bool_]
+) -> rr.DepthImage:
+    """Values of 0..limit as a coloured 8-bit image: 1..255, and 0 where nothing is known."""
+    level = np.clip(value * np.float32(254 / limit), 0, 254) + np.float32(1)
+    levels = np.where(known, level, 0).astype(np.uint8)
+    return rr.DepthImage(levels, colormap="inferno", depth_range=[1.0, 255.0])
+
+
+# How it is laid out
+
+
+def blueprint(*, acquiring: bool, detail: bool) -> rrb.Blueprint:
+    """Layout of the viewer, left to right in the order of the method.
+
+    Parameters
+    ----------
+    acquiring : bool
+        Whether a budget is spent: samples, model and error have views only then.
+    detail : bool
+        Whether the inner read-outs have views too.
+    """
+
+    def image(name: str, *entities: str) -> rrb.Spatial2DView:
+        contents = [f"/camera/{entity}" for entity in entities]
+        return rrb.Spatial2DView(origin="/camera", contents=contents, name=name)
+
+    gas = image("3a Neural gas", "depth", "gas/mask", "gas/triangles", "gas/nodes")
+    gas_long = image("3a Long edges", "depth", "gas/complement")
+    score = image("3b Improvement", "improvement/score", "improvement/unknown")
+    estimate = image("3b Estimate", "improvement/estimate", "improvement/unknown")
+    deviation = image("3b Deviation", "improvement/deviation", "improvement/unknown")
+    columns: list[rrb.Container | rrb.View] = [
+        rrb.Vertical(image("1 Sensor", "depth", "holes"), image("2 Seeds", "seeds")),
+        rrb.Vertical(
+            rrb.Tabs(gas, gas_long) if detail else gas,
+            rrb.Tabs(score, estimate, deviation) if detail else score,
+        ),
+    ]
+    space = ["/camera", "/camera/depth", "/world/nodes", "/world/regions"]
+    if acquiring:
+        columns.append(
+            rrb.Vertical(
+                image("4 Acquired", "samples", "holes"),
+                rrb.Tabs(image("5 Error", "error", "holes"), image("5 Model", "model")),
+            )
+        )
+        space.append("/world/samples")
+    columns.append(rrb.Spatial3DView(origin="/", contents=space, name="In space"))
+
+    def plot(name: str, *figures: str) -> rrb.TimeSeriesView:
+        contents = [f"/figures/{figure}" for figure in figures]
+        return rrb.TimeSeriesView(origin="/figures", contents=contents, name=name)
+
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(*columns, column_shares=[1.0] * (len(columns) - 1) + [1.6]),
+            rrb.Horizontal(
+                rrb.TextDocumentView(origin="/guide", name="How to read it"),
+                plot("Milliseconds per stage", "stages"),
+                rrb.Vertical(
+                    plot("Rate and drops", "fps", "dropped_sensor", "dropped_viewer"),
+                    rrb.StateTimelineView(origin="/sensor/state", name="Sensor"),
+                    row_shares=[2, 1],
+                ),
+                plot("Errors in mm", "quantisation_error_mm", "rmse_mm"),
+                column_shares=[1.3, 1, 1, 1],
+            ),
+            row_shares=[2.2, 1],
+        ),
+        rrb.TimePanel(timeline="frame", play_state="following", state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+    )
+
+
+# Where it goes
+
+
+class _Stream:
+    """A recording stream of its own: what befalls one sink must not touch another."""
+
+    def __init__(self, options: ViewerOptions, layout: rrb.Blueprint, times: StageTimes) -> None:
+        self.options = options
+        self.layout = layout
+        self._times = times
+        self._stream: rr.RecordingStream | None = None
+        self._logger: StepLogger | None = None
+
+    def open(self) -> None:
+        """Open the sink in the thread that will feed it."""
+        self._begin(self._target())
+
+    def put(self, item: Step | StateNote) -> None:
+        """Log a step, or the sensor's state."""
+        assert self._logger is not None
+        if isinstance(item, StateNote):
+            self._logger.log_state(item.state)
+            return
+        with self._times.stage("log"):
+            self._logger.log(item)
+
+    def close(self) -> None:
+        """Send what is left and let go."""
+        if self._stream is not None:
+            self._stream.flush(timeout_sec=EXIT_S)
+            self._stream.disconnect()
+
+    def _target(self) -> rr.FileSink | rr.GrpcSink | rr.GrpcServerSink:
+        raise NotImplementedError
+
+    def _begin(self, target: rr.FileSink | rr.GrpcSink | rr.GrpcServerSink) -> None:
+        self._stream = rr.RecordingStream(APPLICATION)
+        self._stream.set_sinks(target, default_blueprint=self.layout)
+        self._logger = StepLogger(self._stream, self.options)
+
+
+class FileStream(_Stream):
+    """Saves to an .rrd, and keeps it readable whatever happens to the disk.
+
+    The SDK's writer says nothing when a write fails and never ends after it. So room is
+    checked before every step, and once a second what was written is made sure of: after a
+    failure the file is cut back to there.
+    """
+
+    def __init__(
+        self, path: Path, options: ViewerOptions, layout: rrb.Blueprint, times: StageTimes
+    ) -> None:
+        super().__init__(options, layout, times)
+        self.path = path
+        self._sure_bytes = 0
+        self._checked_s = time.monotonic()
+        try:
+            with path.open("wb"):
+                pass
+        except OSError as error:
+            raise OutputError(
+                f"cannot write '{path}': {error.strerror}. Name a file in a folder that exists and"
+                " is yours to write."
+            ) from None
+
+    def _target(self) -> rr.FileSink:
+        return rr.FileSink(str(self.path))
+
+    def put(self, item: Step | StateNote) -> None:
+        """Log a step, if the disk has room for it."""
+        free = shutil.disk_usage(self.path.parent).free
+        if free < SPARE_BYTES:
+            self.close()
+            raise OutputError(
+                f"the disk is full ({free >> 20} MiB free). '{self.path}' was ended and is whole as"
+                " far as it goes; make room and run it again."
+            )
+        super().put(item)
+        if time.monotonic() - self._checked_s > CHECK_EVERY_S:
+            self._make_sure()
+
+    def close(self) -> None:
+        """Write the rest and the index."""
+        if self._stream is not None:
+            self._make_sure()
+            self._stream.disconnect()
+
+    def _make_sure(self) -> None:
+        assert self._stream is not None
+        try:
+            self._stream.flush(timeout_sec=EXIT_S)
+        except RuntimeError as error:
+            _ABANDONED.append(self._stream)
+            os.truncate(self.path, self._sure_bytes)
+            raise OutputError(
+                f"writing '{self.path}' failed after {self._sure_bytes:,} bytes, which are kept"
+                f" ({error}). Check the disk and its quota, and run it again."
+            ) from None
+        self._sure_bytes = self.path.stat().st_size
+        self._checked_s = time.monotonic()
+
+
+class ServerStream(_Stream):
+    """Serves a stream that viewers join, on this machine only unless told otherwise."""
+
+    def __init__(self, options: ViewerOptions, layout: rrb.Blueprint, times: StageTimes) -> None:
+        super().__init__(options, layout, times)
+        self.host, self.port = _host_and_port(options.serve_address)
+        try:
+            with socket.create_server((self.host, self.port)):
+                pass
+        except OSError as error:
+            raise ViewerError(
+                f"cannot serve on {options.serve_address}: {error.strerror}. Another program may"
+                " have the port; give --serve-address 127.0.0.1:PORT with a free one."
+            ) from None
+
+    def _target(self) -> rr.GrpcServerSink:
+        return rr.GrpcServerSink(
+            self.host, self.port, server_memory_limit=self.options.serve_memory
+        )
+
+
+class RemoteStream(_Stream):
+    """Sends to a viewer that is open, waits while it stalls, and finds it again if it restarts.
+
+    Each step is sent before the next is taken, so that a stalled viewer costs one step of
+    memory, not the half gigabyte that the SDK would queue.
+
+    Attributes
+    ----------
+    missed : int
+        Steps taken while no viewer was there.
+    """
+
+    def __init__(
+        self, url: str, options: ViewerOptions, layout: rrb.Blueprint, times: StageTimes
+    ) -> None:
+        super().__init__(options, layout, times)
+        self.url = url
+        self.missed = 0
+        parts = urlsplit(url)
+        if parts.scheme not in ("rerun", "rerun+http", "rerun+https") or not parts.hostname:
+            raise ViewerError(
+                f"'{url}' is no viewer's address; write --connect rerun+http://HOST:PORT/proxy."
+            )
+        self._address = (parts.hostname, parts.port or VIEWER_PORT)
+        self._checked_s = 0.0
+        if not _listens(self._address):
+            raise ViewerError(
+                f"no viewer listens at {url}. Start one there with 'rerun', or leave out --connect."
+            )
+
+    def _target(self) -> rr.GrpcSink:
+        return rr.GrpcSink(self.url)
+
+    def put(self, item: Step | StateNote) -> None:
+        """Log a step and see it off, however long the viewer takes."""
+        if self._stream is None and time.monotonic() - self._checked_s > CHECK_EVERY_S:
+            self._checked_s = time.monotonic()
+            if _listens(self._address):
+                self.open()  # it is back
+        if self._stream is None:
+            self.missed += 1
+            return
+        super().put(item)
+        try:
+            self._stream.flush()
+        except RuntimeError:
+            _ABANDONED.append(self._stream)
+            self._stream = None
+
+    def close(self) -> None:
+        """Let go of the viewer, which keeps what it has."""
+        if self._stream is not None:
+            with contextlib.suppress(RuntimeError):  # it has just been closed: so be it
+                self._stream.flush(timeout_sec=EXIT_S)
+                self._stream.disconnect()
+
+
+class WindowStream(RemoteStream):
+    """Opens a viewer window, or uses the one that is open, which outlives this program."""
+
+    def __init__(self, options: ViewerOptions, layout: rrb.Blueprint, times: StageTimes) -> None:
+        port = VIEWER_PORT
+        if options.serve and _host_and_port(options.serve_address)[1] == VIEWER_PORT:
+            port += 1
+        if not _listens(("127.0.0.1", port)):
+            _start_viewer(port, options.viewer_memory)
+        super().__init__(f"rerun+http://127.0.0.1:{port}/proxy", options, layout, times)
+
+
+_ABANDONED: list[rr.RecordingStream] = []
+"""Streams whose viewer died: letting go of one would wait for that viewer for ever."""
+
+
+def _start_viewer(port: int, memory: str) -> None:
+    try:
+        rr.spawn(
+            port=port,
+            connect=False,
+            memory_limit=memory,
+            hide_welcome_screen=True,
+            executable_path=viewer_executable(),
+        )
+    except RuntimeError as error:
+        raise ViewerError(
+            f"the viewer window does not start ({str(error).splitlines()[0]}). Use --headless"
+            " --save FILE.rrd, and open the file elsewhere."
+        ) from None
+    deadline_s = time.monotonic() + 10
+    while not _listens(("127.0.0.1", port)):
+        if time.monotonic() > deadline_s:
+            raise ViewerError(
+                "the viewer window did not start within 10 s. Use --headless --save FILE.rrd, and"
+                " open the file elsewhere."
+            )
+        time.sleep(0.05)
+
+
+def viewer_executable() -> str | None:
+    """The viewer that came with the SDK; None to search the PATH."""
+    package = importlib.util.find_spec("rerun_cli")
+    if package is None or package.origin is None:
+        return None
+    native = Path(package.origin).with_name("rerun.exe" if os.name == "nt" else "rerun")
+    return str(native) if native.exists() else None
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _listens(address: tuple[str, int]) -> bool:
+    try:
+        with socket.create_connection(address, PROBE_S):
+            return True
+    except OSError:
+        return False
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise ViewerError(f"'{address}' is no address to serve on; write HOST:PORT, 127.0.0.1:9876")
+    return host.strip("[]"), int(port)
+
+
+# All of it together
+
+
+class Viewer:
+    """Every place where a run is seen, each fed by a thread and a stream of its own.
+
+    Parameters
+    ----------
+    options : ViewerOptions
+        Which places.
+    acquiring : bool
+        Whether steps carry an acquisition; it has views then.
+    live : bool
+        A live source waits for nobody: what a place has no time for is dropped there. A
+        recording waits for its file always, and for a viewer that is not stalled.
+    times : StageTimes
+        Where the time that logging takes is added, as stage ``log``.
+
+    Raises
+    ------
+    OutputError, ViewerError
+        If a place cannot be written, reached or opened.
+    """
+
+    def __init__(
+        self, options: ViewerOptions, *, acquiring: bool, live: bool, times: StageTimes
+    ) -> None:
+        layout = blueprint(acquiring=acquiring, detail=options.detail)
+        shared = options, layout, times
+        self.window = not options.headless and has_display()
+        streams: list[tuple[str, _Stream]] = []
+        if options.save is not None:
+            streams.append((f"file '{options.save}'", FileStream(options.save, *shared)))
+        if options.serve:
+            streams.append((f"served stream on {options.serve_address}", ServerStream(*shared)))
+        if options.connect is not None:
+            streams.append((f"viewer at {options.connect}", RemoteStream(options.connect, *shared)))
+        if self.window:
+            streams.append(("viewer window", WindowStream(*shared)))
+        self._places: list[Handover[Step | StateNote]] = [
+            Handover[Step | StateNote](
+                name,
+                stream,
+                lossless=isinstance(stream, FileStream) and not live,
+                patience_s=0.0 if live else STALL_S,
+                capacity=FILE_QUEUE if isinstance(stream, FileStream) else 2,
+            )
+            for name, stream in streams
+        ]
+        self._file = self._places[0] if options.save is not None else None
+
+    def show(self, item: Step | StateNote) -> None:
+        """Hand a step, or the sensor's state without one, to every place.
+
+        Raises
+        ------
+        Exception
+            What ended the file that was asked for; a viewer that is gone is no error.
+        """
+        for place in self._places:
+            place.offer(item)
+            if place is self._file and place.failure is not None:
+                raise place.failure
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Steps that each place has missed, by its name."""
+        return {place.name: place.dropped for place in self._places}
+
+    def close(self) -> list[str]:
+        """Finish every place, within `EXIT_S` each and 3 s in all.
+
+        Returns
+        -------
+        list of str
+            What went wrong, a sentence each.
+        """
+        # From here on the SDK may not wait for anybody at exit: it would wait for ever.
+        rr.unregister_shutdown()
+        deadline_s = time.monotonic() + 2.5
+        troubles = []
+        for place in self._places:
+            if not place.finish(max(0.1, deadline_s - time.monotonic())):
+                troubles.append(f"the {place.name} had stalled and was left behind.")
+            elif place.failure is not None:
+                troubles.append(f"the {place.name} ended early: {place.failure}")
+        return troubles
+
+
+# Pictures of it
+
+
+def screenshot(recording: Path, picture: Path, frame: int | None = None) -> None:
+    """Show a recording in an invisible viewer and take its picture, 1920x1080.
+
+    Parameters
+    ----------
+    recording : Path
+        An .rrd that `--save` wrote.
+    picture : Path
+        PNG to write.
+    frame : int, optional
+        Frame to show; default the last.
+
+    Raises
+    ------
+    ViewerError
+        If the viewer does not run here; it needs a graphics driver (Mesa's lavapipe will do).
+    """
+    from rerun.experimental import ViewerClient
+
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = int(free.getsockname()[1])
+    try:
+        client = ViewerClient.spawn(
+            headless=True,
+            port=port,
+            hide_welcome_screen=True,
+            executable_path=viewer_executable(),
+        )
+    except RuntimeError as error:
+        raise ViewerError(
+            f"the viewer does not start ({str(error).splitlines()[0]}). Install a graphics driver:"
+            " apt-get install mesa-vulkan-drivers libvulkan1."
+        ) from None
+    try:
+        client.open(str(recording.resolve()))
+        time.sleep(3)  # it loads and lays out in its own time and tells nobody when it is done
+        if frame is not None:
+            client.set_time("frame", sequence=frame)
+            time.sleep(2)
+        client.save_screenshot(str(picture.resolve()))
+    finally:
+        client.quit()
