@@ -411,7 +411,7 @@ def test_a_wrong_sidecar_names_the_entry_and_what_is_allowed(
 # Nothing but the named errors, whatever is in the files
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(data=st.binary(max_size=200))
 def test_any_bytes_as_sidecar_give_settings_or_a_named_error(
     tmp_path_factory: pytest.TempPathFactory, data: bytes
@@ -428,8 +428,7 @@ _VALUES = st.recursive(
     | st.integers(-(2**70), 2**70)
     | st.floats()
     | st.text(max_size=5)
-    | st.just(640)
-    | st.just(480),
+    | st.sampled_from([6, 8]),
     lambda inner: (
         st.lists(inner, max_size=3)
         | st.dictionaries(
@@ -440,7 +439,7 @@ _VALUES = st.recursive(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(
     entries=st.dictionaries(
         st.sampled_from([*Sidecar.__dataclass_fields__, "other"]), _VALUES, max_size=5
@@ -451,13 +450,13 @@ def test_any_toml_as_sidecar_opens_the_folder_or_gives_a_named_error(
 ) -> None:
     folder = tmp_path_factory.getbasetemp() / "any-toml"
     if not folder.exists():
-        _png(folder / "0.png", _depth(480, 640))
+        _png(folder / "0.png")
     (folder / SIDECAR).write_text("\n".join(f"{k} = {_toml(v)}" for k, v in entries.items()))
     try:
         frame = _frames(folder)[0]
     except SourceError:
         return
-    assert frame.shape == (480, 640)
+    assert frame.shape == (6, 8)
 
 
 def _toml(value: object) -> str:
@@ -472,7 +471,7 @@ def _toml(value: object) -> str:
     return repr(value)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(
     changes=st.lists(st.tuples(st.integers(0, 10**6), st.integers(1, 255)), max_size=4),
     cut=st.none() | st.integers(0, 10**6),
