@@ -12,9 +12,9 @@ from selective_depth.drivers.oni_file import inspect_oni
 from selective_depth.drivers.openni_device import DeviceSettings
 from selective_depth.drivers.openni_process import Worker, error_of
 from selective_depth.drivers.openni_replay import OpenNIRecording
-from selective_depth.drivers.source import SourceError, SourceNotFoundError
+from selective_depth.drivers.source import DeviceRefusedError, SourceError, SourceNotFoundError
 
-_OPEN_S = 10.0
+_OPEN_S = 10.0  # a sensor that loads its firmware takes seconds
 _STALL_S = 5.0  # silence of the sensor after which a recording is ended
 _HANG_S = 5.0  # silence of the worker, which reports five times a second
 _SAVE_S = 10.0  # for the recorder to write what it still holds
@@ -86,7 +86,9 @@ def record(
         As for `OpenNIDevice`.
     """
     path = Path(out_path)
-    file = _create(path, overwrite)
+    # Under another name until the sensor streams: an older recording is not lost for nothing.
+    unborn = path.with_name(path.name + ".part")
+    file = _create(path, unborn, overwrite)
     started = time.monotonic()
     try:
         worker = Worker(
@@ -101,59 +103,71 @@ def record(
             stall_s=_STALL_S,
         )
         try:
+            _wait_for_stream(worker)
+            unborn.replace(path)
             ended, seen = _follow(worker, progress)
         finally:
             worker.close(grace_s=1.0)
-    except BaseException:
-        if os.fstat(file).st_size == 0:
-            path.unlink()
-        raise
     finally:
         os.close(file)
+        unborn.unlink(missing_ok=True)
     seconds = time.monotonic() - started
     counted, problem = _verify(path, seen)
     return RecordingReport(path, counted, seconds, ended, problem)
 
 
-def _create(path: Path, overwrite: bool) -> int:
+def _create(path: Path, unborn: Path, overwrite: bool) -> int:
     if path.suffix.lower() != ".oni":
         raise SourceNotFoundError(f"'{path}' must end in .oni to be a recording.")
+    if path.is_dir():
+        raise SourceNotFoundError(f"'{path}' is a folder. Give the name of a file in it.")
     if not overwrite and path.exists() and path.stat().st_size > 0:
         raise SourceNotFoundError(f"'{path}' exists already. Give another name, or --overwrite.")
     try:
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
+        return os.open(unborn, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
     except OSError as error:
         raise SourceNotFoundError(
             f"'{path}' cannot be written: {error.strerror}. Give a place that can."
         ) from error
 
 
+def _wait_for_stream(worker: Worker) -> None:
+    """Wait until the sensor streams into the recorder."""
+    while True:
+        message = worker.receive(_OPEN_S)
+        if message is None:
+            raise DeviceRefusedError(f"The sensor does not open: OpenNI2 hangs for {_OPEN_S:g} s.")
+        if message["kind"] == "error":
+            raise error_of(message)
+        if message["kind"] == "died":
+            raise DeviceRefusedError(f"The sensor does not open: {message['reason']}.")
+        if message["kind"] == "opened":
+            return
+
+
 def _follow(worker: Worker, progress: Callable[[int], None] | None) -> tuple[str, int]:
     """Wait until the file is saved; say what ended it and how many frames were seen."""
     interrupted = False
-    patience_s = _OPEN_S
     seen = 0
     while True:
+        patience_s = _SAVE_S if interrupted else _HANG_S
         try:
             message = worker.receive(patience_s)
             if message is None:
                 return f"OpenNI2 hangs for {patience_s:g} s", seen
-            if message["kind"] == "error":
-                raise error_of(message)
             if message["kind"] == "died":
                 return str(message["reason"]), seen
+            if message["kind"] == "error":
+                return str(message["message"]), seen
             if message["kind"] == "saved":
                 return "interrupted" if interrupted else str(message["ended"]), seen
-            patience_s = _SAVE_S if interrupted else _HANG_S
-            if message["kind"] == "recorded":
-                seen = int(message["frames"])
-                if progress is not None:
-                    progress(seen)
+            seen = int(message["frames"])
+            if progress is not None:
+                progress(seen)
         except KeyboardInterrupt:
             if interrupted:
                 raise
             interrupted = True
-            patience_s = _SAVE_S
             worker.stop()
 
 

@@ -100,7 +100,7 @@ class VirtualSensor:
         )
         (drivers / "libVirtualSensor.so.0").symlink_to(build_driver())
         self._control = folder / "control.txt"
-        self._keys: dict[str, object] = {"connected": 1}
+        self._keys: dict[str, int | Path] = {"connected": 1}
         if frames is not None:
             file = folder / "frames.raw"
             frames.astype(np.uint16).tofile(file)
@@ -115,7 +115,7 @@ class VirtualSensor:
             "VIRTUAL_SENSOR_CONTROL": str(self._control),
         }
 
-    def set(self, **keys: int) -> None:
+    def set(self, **keys: int | Path) -> None:
         """Change the sensor, now; it takes effect within a few milliseconds."""
         self._keys |= keys
         lines = "".join(f"{key}={value}\n" for key, value in self._keys.items())
