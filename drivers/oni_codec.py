@@ -9,16 +9,17 @@ Then follow the first value, 16 bits, and bytes:
 byte            meaning
 =============== =======================================================================
 ``0xAB``        A, B <= 12: two differences, A - 6 and B - 6, to subtract
-``0xAD``        one difference, A - 6 (the last pixel of an odd number)
+``0xAD``        one difference, A - 6: the last pixel
 ``0xAF``        one difference, A - 6, then a full value as after ``0xFF``
 ``0xE0 + n``    n <= 15: the value 2 n times more
 ``0xFF``        next byte b >= 128: difference b - 192; b < 128: value 256 b + next byte
 =============== =======================================================================
 
-Written from the format, not from OpenNI2's own code; tests compare it with the real runtime bit
-by bit. Unlike that, it checks every byte: a damaged payload is an error, never a wrong frame of
-the right size where that can be known, and never an access out of bounds. It also keeps the order
-of the last bytes where OpenNI2's encoder swaps them (a run of one value before a lone last pixel).
+OpenNI2's encoder has a flaw: a lone last pixel after a run is written before the run, and its
+player then shows up to 29 wrong pixels in the corner of the image. No other use of ``0xAD`` before
+a run is possible, so the true order is restored here. All other frames are those of OpenNI2 bit by
+bit. Unlike its player, every byte is checked: a damaged payload is an error where that can be
+known, and never an access out of bounds.
 """
 
 from __future__ import annotations
@@ -129,13 +130,21 @@ def _decode(coded: _Bytes, table: _Depth, depth: _Depth) -> bool:
     while at < end:
         byte = _signed(coded[at])
         at += 1
+        run = 0
         if 0xE0 < byte < 0xF0:
             run = 2 * (byte - 0xE0)
-            if pixel + run > pixels:
+        elif byte < 0xD0 and byte & 0x0F == 0x0D and at == end - 1:
+            # The last pixel, written before the run that precedes it.
+            run = 2 * (_signed(coded[at]) - 0xE0)
+            at += 1
+            if not 2 <= run <= 30:
                 return False
-            for _ in range(run):
-                depth[pixel] = depth[pixel - 1]
-                pixel += 1
+        if pixel + run > pixels:
+            return False
+        for _ in range(run):
+            depth[pixel] = depth[pixel - 1]
+            pixel += 1
+        if 0xE0 < byte < 0xF0:
             continue
         second = 0x0F
         if byte < 0xD0:
@@ -148,7 +157,7 @@ def _decode(coded: _Bytes, table: _Depth, depth: _Depth) -> bool:
             if second == 0x0E:
                 return False
             if second == 0x0D:
-                continue
+                break
         elif byte != 0xFF:
             return False
         if second != 0x0F:
@@ -169,7 +178,7 @@ def _decode(coded: _Bytes, table: _Depth, depth: _Depth) -> bool:
             return False
         depth[pixel] = table[value] if table.size > 0 else value
         pixel += 1
-    return pixel == pixels
+    return at == end and pixel == pixels
 
 
 @njit(cache=True, nogil=True)

@@ -21,7 +21,7 @@ Depth = npt.NDArray[np.uint16]
 
 
 def _reference_decode(coded: bytes, table: list[int] | None) -> list[int] | None:
-    """Values of a code, None if it is no code; a dict of all 16-bit values is no table."""
+    """Values of a code, None if it is no code; without a table the values are depths."""
     if len(coded) < 2:
         return None
     values = [coded[0] + 256 * coded[1]]
@@ -51,6 +51,10 @@ def _reference_decode(coded: bytes, table: list[int] | None) -> list[int] | None
         elif first == 0xE and second > 0:
             values += [values[-1]] * (2 * second)
         elif first <= 12 and second != 14:
+            if second == 13:
+                if len(rest) > 1 or (rest and not 0xE1 <= rest[0] <= 0xEF):
+                    return None
+                values += [values[-1]] * (2 * (rest.pop() - 0xE0) if rest else 0)
             step(first)
             if second == 15:
                 if not full():
@@ -146,7 +150,18 @@ def test_codes_mean_what_the_table_says(payload: str, expected: list[int]) -> No
 
 @pytest.mark.parametrize(
     "payload",
-    ["", "0a", "0a00 e0", "0a00 f1 00", "0a00 d6", "0a00 6e", "0a00 ff", "0a00 ff 12", "0a00 6f"],
+    [
+        "",
+        "0a",
+        "0a00 e0",
+        "0a00 f1 00",
+        "0a00 d6",
+        "0a00 6e",
+        "0a00 ff",
+        "0a00 ff 12",
+        "0a00 6f",
+        "0a00 6d 66",
+    ],
 )
 def test_codes_that_no_encoder_makes_are_damage(payload: str) -> None:
     for pixels in range(1, 8):
@@ -173,10 +188,14 @@ def test_a_table_out_of_order_or_too_short_is_damage() -> None:
     assert decode_depth(CODEC_TABLE, bytes.fromhex("0000 0000"), 1, 1) is None
 
 
-def test_a_run_before_a_lone_last_pixel_keeps_its_order() -> None:
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_run_before_a_lone_last_pixel_is_restored(swapped: bool) -> None:
     """OpenNI2's own encoder writes the last pixel before the run that precedes it."""
-    depth_mm = np.array([[7, 7, 7, 8]], np.uint16)
-    decoded = decode_depth(CODEC_TABLE, encode_depth(depth_mm), 1, 4)
+    payload = encode_depth(np.array([[7, 7, 7, 8]], np.uint16))
+    assert payload[-2:] == b"\xe1\x5d"
+    if swapped:
+        payload = payload[:-2] + payload[:-3:-1]
+    decoded = decode_depth(CODEC_TABLE, payload, 1, 4)
     assert decoded is not None and decoded.tolist() == [[7, 7, 7, 8]]
 
 
