@@ -156,7 +156,7 @@ def node_pixels(nodes_mm: npt.NDArray[np.float32], seeds: SeedGrid) -> npt.NDArr
         Nodes in millimetres.
     seeds : SeedGrid
         The seeds they were trained on. With a camera the nodes are projected; without one, each
-        takes the mean pixel of the seeds nearest to it.
+        takes the mean pixel of the four seeds nearest to it, the nearer the heavier.
 
     Returns
     -------
@@ -166,9 +166,14 @@ def node_pixels(nodes_mm: npt.NDArray[np.float32], seeds: SeedGrid) -> npt.NDArr
         return seeds.camera.project_uv(nodes_mm)
     near = min(4, len(seeds.uv))
     distance, index = cKDTree(seeds.points_mm).query(nodes_mm, k=[*range(1, near + 1)])
+    uv = seeds.uv[index]
     weight = 1 / (distance + 1e-3)
-    uv = (seeds.uv[index] * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[:, None]
-    return uv.astype(np.float32)
+    # Neighbours in space may lie at both ends of a panorama's rows: no mean over the seam.
+    weight[np.abs(uv[..., 0] - uv[:, :1, 0]) > seeds.frame_shape[1] / 4] = 0
+    mean: npt.NDArray[np.float64] = (uv * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[
+        :, None
+    ]
+    return mean.astype(np.float32)
 
 
 def _finite_points(seeds: SeedGrid) -> npt.NDArray[np.float32]:

@@ -16,6 +16,8 @@ NEGLIGIBLE = 1e-3
 """Nodes whose rank k has exp(-k / lambda) below this are left where they are."""
 
 _MEMBERS = 16  # nodes per group; the nearest members of all groups are found in one sweep
+_FEW = 32  # up to here, ordering by comparing all with all is the faster way
+_SLACK = 1.2  # how much farther than expected the nodes that move are looked for
 _FAR = np.float32(1e18)  # where the padding of the last groups lies: its square is still finite
 
 
@@ -142,13 +144,14 @@ def _winner(d2, nearest):  # type: ignore[no-untyped-def]
 def _within(d2, nearest, reach, found, key):  # type: ignore[no-untyped-def]
     """Nodes not farther than `reach` (squared); returns how many."""
     groups = len(nearest)
-    count = np.uint32(0)
+    count = 0
     for g in range(groups):
         if nearest[g] <= reach:
             for m in range(_MEMBERS):
+                # Always written, counted only if near: cheaper than a branch.
                 found[count] = m * groups + g
                 key[count] = d2[m, g]
-                count += np.uint32(d2[m, g] <= reach)
+                count += int(d2[m, g] <= reach)
     return count
 
 
@@ -157,54 +160,64 @@ def _order_few(key, found, count, order):  # type: ignore[no-untyped-def]
     """Order by counting the smaller keys: quadratic, but free of branches."""
     for i in range(count):
         own = key[i]
-        rank = np.int32(0)
+        rank = 0
         for j in range(i):
-            rank += np.int32(key[j] <= own)
+            rank += int(key[j] <= own)
         for j in range(i + 1, count):
-            rank += np.int32(key[j] < own)
+            rank += int(key[j] < own)
         order[rank] = found[i]
 
 
 @njit(cache=True, nogil=True)
-def _order_many(key, found, count, reach, order, packed, packed2, starts):  # type: ignore[no-untyped-def]
-    """Order by two passes of a radix sort over the distance in steps of `reach` / 2^20."""
-    bits = np.uint32(10)
+def _order_many(key, found, count, order, packed, spare, starts):  # type: ignore[no-untyped-def]
+    """Order by two passes of a radix sort, over distance and place packed into 32 bits."""
+    place_bits = np.uint32(1)
+    while count > np.uint32(1) << place_bits:
+        place_bits += np.uint32(1)
+    # Few keys need fewer buckets: clearing and summing those would take longer than the keys.
+    bits = min(np.uint32(32 - place_bits) >> np.uint32(1), np.uint32(10 if count > 600 else 7))
     buckets = np.uint32(1) << bits
-    low, high = starts[0], starts[1]
-    for b in range(buckets + 1):
-        low[b] = 0
-        high[b] = 0
-    scale = np.float32((buckets * buckets - 64.0) / max(reach, np.float32(1e-30)))
     mask = buckets - np.uint32(1)
+    to_high = place_bits + bits
+    low, high = starts[0], starts[1]
+    low[: buckets + 1] = 0
+    high[: buckets + 1] = 0
+    largest = np.float32(1e-30)
     for i in range(count):
-        q = np.uint32(key[i] * scale)
-        packed[i] = np.uint64(q) << np.uint64(32) | np.uint64(i)
-        low[(q & mask) + np.uint32(1)] += np.uint32(1)
-        high[(q >> bits) + np.uint32(1)] += np.uint32(1)
+        largest = max(largest, key[i])
+    scale = np.float32((buckets * buckets - 1) * 0.9999 / largest)
+    for i in range(count):
+        step = np.uint32(key[i] * scale)
+        packed[i] = step << place_bits | np.uint32(i)
+        low[(step & mask) + np.uint32(1)] += np.uint32(1)
+        high[(step >> bits) + np.uint32(1)] += np.uint32(1)
     for b in range(buckets):
         low[b + 1] += low[b]
         high[b + 1] += high[b]
     for i in range(count):
         item = packed[i]
-        b = np.uint32(item >> np.uint64(32)) & mask
-        packed2[low[b]] = item
+        b = item >> place_bits & mask
+        spare[low[b]] = item
         low[b] += np.uint32(1)
     for i in range(count):
-        item = packed2[i]
-        b = np.uint32(item >> np.uint64(42))
+        item = spare[i]
+        b = item >> to_high
         packed[high[b]] = item
         high[b] += np.uint32(1)
-    # Keys that fell into one step are still in the order found: put those few right.
+    place = (np.uint32(1) << place_bits) - np.uint32(1)
     for i in range(count):
-        place = np.uint32(packed[i] & np.uint64(0xFFFFFFFF))
-        own = key[place]
+        item = packed[i]
+        order[i] = found[item & place]
+        # Distances that share a step are in the order found: put these few right.
         j = i
-        while j > 0 and key[np.uint32(packed[j - 1] & np.uint64(0xFFFFFFFF))] > own:
+        while j > 0 and packed[j - 1] >> place_bits == item >> place_bits:
+            if key[packed[j - 1] & place] <= key[item & place]:
+                break
             packed[j] = packed[j - 1]
+            order[j] = order[j - 1]
             j -= 1
-        packed[j] = np.uint64(place)
-    for i in range(count):
-        order[i] = found[np.uint32(packed[i] & np.uint64(0xFFFFFFFF))]
+        packed[j] = item
+        order[j] = found[item & place]
 
 
 @njit(cache=True, nogil=True)
@@ -218,11 +231,11 @@ def _anneal(points, nodes, count, draws, lambda_first):  # type: ignore[no-untyp
     key = np.empty(size + 1, np.float32)
     found = np.empty(size + 1, np.uint32)
     order = np.empty(size + 1, np.uint32)
-    packed = np.empty(size + 1, np.uint64)
-    packed2 = np.empty(size + 1, np.uint64)
+    packed = np.empty(size + 1, np.uint32)
+    spare = np.empty(size + 1, np.uint32)
     starts = np.empty((2, 1025), np.uint32)
-    # How far the farthest moving node was when this point was last drawn: the next guess.
-    reaches = np.full(len(points), np.float32(1e38), np.float32)
+    # Squared distance of the farthest node moved, per node moved, when a point was last drawn.
+    reaches = np.full(len(points), np.float32(1e33), np.float32)
     cut = -math.log(NEGLIGIBLE)
     log_alpha = math.log(ALPHA[1] / ALPHA[0])
     log_lambda = math.log(LAMBDA_LAST / lambda_first)
@@ -242,23 +255,22 @@ def _anneal(points, nodes, count, draws, lambda_first):  # type: ignore[no-untyp
             wz[i] += h * (z - wz[i])
             continue
         if moving == count:
-            reach = np.float32(0)
             for i in range(count):
                 key[i] = flat_d2[i]
                 found[i] = i
-                reach = max(reach, key[i])
             have = count
         else:
-            reach = reaches[p]
+            # On a surface the number of nodes met grows like the square of the distance.
+            reach = reaches[p] * moving * np.float32(_SLACK)
             have = _within(d2, nearest, reach, found, key)
             while have < moving:
                 reach = reach * np.float32(1.5) + np.float32(1e-6)
                 have = _within(d2, nearest, reach, found, key)
-        if have > 128:
-            _order_many(key, found, have, reach, order, packed, packed2, starts)
+        if have > _FEW:
+            _order_many(key, found, have, order, packed, spare, starts)
         else:
             _order_few(key, found, have, order)
-        reaches[p] = flat_d2[order[moving - 1]]
+        reaches[p] = flat_d2[order[moving - 1]] / np.float32(moving)
         decay = math.exp(-1.0 / reach_ranks)
         weight = alpha
         for k in range(moving):

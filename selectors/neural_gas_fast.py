@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Self
 
@@ -120,11 +121,15 @@ class BatchNeuralGas:
         self.nodes_uv_ -= low
         winner = np.empty(len(points), dtype=np.int32)
         d2 = np.empty((2, len(points)), dtype=np.float32)
+        find: Callable[..., None] = _find_two
         done = 0
         while True:
             bins = _sort_into_bins(self.nodes_mm_, self.nodes_uv_, bin_px, rows, columns)
-            search = partial(_find_two, points, uv, bin_px, rows, columns, *bins, winner, d2)
-            in_bands(search, len(points), self._threads)
+            in_bands(
+                partial(find, points, uv, bin_px, rows, columns, *bins, winner, d2),
+                len(points),
+                self._threads,
+            )
             if done == 0:
                 self.reheated_ = _mean_distance(d2[0]) > most
                 passes = COLD_PASSES if self.reheated_ else passes
@@ -255,8 +260,8 @@ def _move(points, uv, winner, d2, nodes, nodes_uv, relocate):  # type: ignore[no
         useless = 0
         needed = 0
         for j in range(count):
-            useless += np.int32(utility[j] < level)
-            needed += np.int32(GAIN * error[j] > level)
+            useless += int(utility[j] < level)
+            needed += int(GAIN * error[j] > level)
         if useless < needed:
             low = level
         else:
