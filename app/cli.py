@@ -39,25 +39,28 @@ DEFAULTS = Settings()
 
 @command(
     "Watch",
+    (f"{PROGRAM} replay", "the recording that comes with the program"),
     (f"{PROGRAM} replay walk.oni", "every frame of a recording, in the viewer"),
     (f"{PROGRAM} replay frames/ --headless --save out.rrd", "a folder of PNG frames, to a file"),
     (f"{PROGRAM} replay virtual:firehose --budget 0.05 --rounds 4", "and measure 5 % more"),
     (f"{PROGRAM} replay walk.oni --realtime --serve", "as live, for viewers elsewhere to join"),
 )
-def replay(source: Source, /, settings: Options = DEFAULTS) -> int:
+def replay(source: Source = "", /, settings: Options = DEFAULTS) -> int:
     """Replay a recording through both selectors.
 
     Parameters
     ----------
     source : str
         A recording (.oni), a folder of 16-bit PNG frames, an object (.ply), or a made scene
-        (virtual:workstation, virtual:ball, virtual:firehose).
+        (virtual:workstation, virtual:ball, virtual:firehose); by default the recording that
+        comes with the program.
     settings : Settings
         All options.
     """
+    from selective_depth.app.samples import bundled_recording
     from selective_depth.app.session import watch
 
-    return watch(source, settings)
+    return watch(source or bundled_recording(), settings)
 
 
 @command(
@@ -81,6 +84,77 @@ def live(
     from selective_depth.app.session import watch
 
     return watch(f"openni:{device}" if device else "openni", settings)
+
+
+@command(
+    "Sensors",
+    (f"{PROGRAM} record walk.oni", "until Ctrl-C"),
+    (f"{PROGRAM} record walk.oni --seconds 10", "ten seconds"),
+    (f"{PROGRAM} record walk.oni 1d27/0609@1/3 --frames 300", "from one of several sensors"),
+)
+def record(
+    out: Annotated[Path, arg(metavar="OUT.oni")],
+    device: Annotated[str, arg(metavar="DEVICE")] = "",
+    /,
+    frames: Annotated[int | None, arg(metavar="N")] = None,
+    seconds: Annotated[float | None, arg(metavar="SECONDS")] = None,
+    overwrite: bool = False,
+) -> int:
+    """Record a sensor to an .oni file, and make sure that every frame is in it.
+
+    Parameters
+    ----------
+    out : Path
+        The file to make.
+    device : str
+        Its address as 'selective-depth devices' shows it; by default the only one there is.
+    frames : int
+        Stop after this many frames; by default with Ctrl-C.
+    seconds : float
+        Stop after this time; by default with Ctrl-C.
+    overwrite : bool
+        Replace a file of that name.
+    """
+    from selective_depth.app.sensors import record_sensor
+
+    return record_sensor(out, device, frames=frames, seconds=seconds, overwrite=overwrite)
+
+
+@command("Sensors", (f"{PROGRAM} devices", "what is plugged in, or what is missing"))
+def devices() -> int:
+    """List the sensors that OpenNI2 finds, or say what is missing and what to install."""
+    from selective_depth.app.sensors import print_devices
+
+    return print_devices()
+
+
+@command(
+    "Pictures",
+    (f"{PROGRAM} screenshot out.rrd out.png", "the viewer on a recording that --save wrote"),
+)
+def screenshot(
+    recording: Annotated[Path, arg(metavar="FILE.rrd")],
+    picture: Annotated[Path, arg(metavar="FILE.png")],
+    /,
+    frame: Annotated[int | None, arg(metavar="N")] = None,
+) -> int:
+    """Take a picture of the viewer without a display; it needs a graphics driver.
+
+    Parameters
+    ----------
+    recording : Path
+        A Rerun recording, as --save writes it.
+    picture : Path
+        The picture to make, 1920x1080.
+    frame : int
+        The frame to show; by default the last.
+    """
+    from selective_depth.app import viewer
+    from selective_depth.app.report import say
+
+    viewer.screenshot(recording, picture, frame)
+    say(f"wrote {picture}")
+    return OK
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -64,12 +64,13 @@ def check(settings: Settings) -> None:
         Naming the option, its value and what is allowed.
     """
     run, spend, seen = settings.run, settings.acquire, settings.viewer
+    far_mm = 65535 if seen.far_mm is None else seen.far_mm
     for option, value, allowed, good in (
         ("--frames", run.frames, "1 or more", run.frames is None or run.frames >= 1),
         ("--budget", spend.budget, "a share between 0 and 1", 0 <= spend.budget <= 1),
         ("--rounds", spend.rounds, "between 1 and 255", 1 <= spend.rounds <= 255),
-        ("--near-mm", seen.near_mm, "0 or more", seen.near_mm >= 0),
-        ("--far-mm", seen.far_mm, "more than --near-mm", seen.far_mm > seen.near_mm),
+        ("--near-mm", seen.near_mm, "0 or more", (seen.near_mm or 0) >= 0),
+        ("--far-mm", far_mm, "more than --near-mm", far_mm > (seen.near_mm or 0)),
     ):
         if not good:
             raise UsageError(f"{option} is {value}; it must be {allowed}.")
@@ -126,10 +127,7 @@ class Session:
                 source = stack.enter_context(RealtimeSource(source))
             report.live = source.live
             loop = stack.enter_context(Loop(settings, every_model=not source.live))
-            acquiring = settings.acquire.budget > 0
-            viewer = Viewer(
-                settings.viewer, acquiring=acquiring, live=source.live, times=loop.times
-            )
+            viewer = Viewer(settings.viewer, live=source.live, times=loop.times)
             try:
                 self._turn_all(source, loop, viewer)
                 code = OK

@@ -86,10 +86,10 @@ class ViewerOptions:
     """Memory of the served stream, for viewers that join late; then the oldest goes."""
     viewer_memory: Annotated[str, arg(metavar="SIZE")] = "2GiB"
     """Memory of the viewer window; then the oldest goes."""
-    near_mm: Annotated[int, arg(metavar="MM")] = 500
-    """Depth at the dark end of the colour scale; fixed, so that colours never jump."""
-    far_mm: Annotated[int, arg(metavar="MM")] = 5000
-    """Depth at the bright end of the colour scale."""
+    near_mm: Annotated[int | None, arg(metavar="MM")] = None
+    """Depth at the dark end of the colour scale; by default what suits the first frame."""
+    far_mm: Annotated[int | None, arg(metavar="MM")] = None
+    """Depth at its bright end. Both hold for the whole run, so that colours never jump."""
     detail: bool = False
     """Show the kriging estimate, its variance and the long-edge triangles too."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -12,6 +13,9 @@ import numpy as np
 
 KEPT = 1 << 16
 """Durations kept per stage: at 30 fps the last 36 minutes, 256 KB."""
+
+STAGES = ("read", "seeds", "neural_gas", "improvement", "acquire", "model", "log", "loop")
+"""Stages of the loop, in the order in which they are shown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +67,16 @@ class StageTimes:
             self._last[name] = duration_ms
 
     def last_ms(self) -> dict[str, float]:
-        """Latest duration of every stage that has run."""
+        """Latest duration of each of the `STAGES`; NaN of one that has not run."""
         with self._lock:
-            return dict(self._last)
+            return {name: self._last.get(name, math.nan) for name in STAGES}
 
     def summary(self) -> dict[str, StageSummary]:
-        """Median, 99th percentile and maximum of every stage, in the order of first use."""
+        """Median, 99th percentile and maximum of every stage, in their order."""
         with self._lock:
-            return {name: self._summarise(name) for name in self._rings}
+            names = [name for name in STAGES if name in self._rings]
+            names += [name for name in self._rings if name not in STAGES]
+            return {name: self._summarise(name) for name in names}
 
     def _summarise(self, name: str) -> StageSummary:
         durations = self._rings[name][: self._counts[name]]

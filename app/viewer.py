@@ -23,7 +23,7 @@ from selective_depth.app.errors import ViewerError
 from selective_depth.app.handover import Handover
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.step import StateNote, Step
-from selective_depth.app.timing import StageTimes
+from selective_depth.app.timing import STAGES, StageTimes
 from selective_depth.drivers.source import OutputError
 
 APPLICATION = "selective-depth"
@@ -64,7 +64,7 @@ class StepLogger:
         self._options = options
         self._start_us: int | None = None
         self._state = ""
-        self._stages: list[str] = []
+        self._limits_mm = (0.0, 1.0)
 
     def log(self, step: Step) -> None:
         """Log a step under its frame's number and time."""
@@ -87,7 +87,17 @@ class StepLogger:
             self._stream.log("sensor/state", rr.StateChange(state=state))
 
     def _log_static(self, step: Step) -> None:
-        camera, log = step.frame.camera, self._stream.log
+        camera, log, options = step.frame.camera, self._stream.log, self._options
+        near, far = legend.depth_limits_mm(step.frame.depth_mm)
+        near = near if options.near_mm is None else options.near_mm
+        far = far if options.far_mm is None else options.far_mm
+        self._limits_mm = (float(near), float(max(far, near + 1)))
+        layout = blueprint(
+            acquiring=step.acquisition is not None,
+            detail=options.detail,
+            look_at_m=_middle_m(step.frame.depth_mm),
+        )
+        self._stream.send_blueprint(layout, make_default=True)
         self._stream.send_recording_name(step.frame.source or "depth")
         log("/", rr.ViewCoordinates.RDF, static=True)
         pinhole = rr.Pinhole(
@@ -97,6 +107,8 @@ class StepLogger:
             image_plane_distance=0.3,
         )
         log("camera", pinhole, static=True)
+        pixels = step.seeds.lattice_uv.reshape(-1, 2) + CENTRE
+        log("camera/seeds", rr.Points2D.from_fields(positions=pixels, radii=1.6), static=True)
         for path, label, colour in (
             ("camera/holes", "no measurement", legend.HOLE),
             ("camera/improvement/unknown", "too far from any sample", legend.HOLE),
@@ -105,6 +117,8 @@ class StepLogger:
         ):
             classes = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, label, colour)])
             log(path, classes, static=True)
+        rounds = 0 if step.acquisition is None else int(step.acquisition.round.max(initial=0))
+        log("legend", rr.Image(legend.picture(self._limits_mm, rounds)), static=True)
         log("guide", rr.TextDocument(legend.HOW_TO_READ, media_type="text/markdown"), static=True)
         states = rr.StateConfiguration(
             values=list(legend.STATE_COLOURS),
@@ -112,20 +126,21 @@ class StepLogger:
             colors=list(legend.STATE_COLOURS.values()),
         )
         log("sensor/state", states, static=True)
-        for name, label in legend.FIGURES.items():
-            log(f"figures/{name}", rr.SeriesLines(names=label), static=True)
+        stages = rr.SeriesLines(names=list(STAGES), colors=list(legend.STAGE_COLOURS))
+        log("figures/stages", stages, static=True)
+        for name, (label, colour) in legend.FIGURES.items():
+            log(f"figures/{name}", rr.SeriesLines(names=label, colors=colour), static=True)
 
     def _log_sensor(self, step: Step) -> None:
         log, depth_mm, seeds = self._stream.log, step.frame.depth_mm, step.seeds
         log("camera/depth", self._depth_image(depth_mm))
-        log("camera/holes", rr.SegmentationImage((depth_mm == 0).view(np.uint8)))
-        near, far = self._options.near_mm, self._options.far_mm
+        log("camera/holes", rr.SegmentationImage((depth_mm == 0).view(np.uint8), opacity=1.0))
+        near, far = self._limits_mm
         level = np.clip((seeds.depth_mm.ravel() - near) * (255 / (far - near)), 0, 255)
         colours = np.where(
             seeds.valid.ravel(), DEPTH_COLOURS[level.astype(np.uint8)], np.uint32(legend.HOLE)
         )
-        positions = seeds.lattice_uv.reshape(-1, 2) + CENTRE
-        log("camera/seeds", rr.Points2D(positions, colors=colours, radii=0.9))
+        log("camera/seeds", rr.Points2D.from_fields(colors=colours))
         self.log_state(step.state)
 
     def _log_gas(self, step: Step) -> None:
@@ -149,7 +164,9 @@ class StepLogger:
         log, improvement = self._stream.log, step.improvement
         known = improvement.known
         log("camera/improvement/score", _map_image(improvement.score, 1.0, known))
-        log("camera/improvement/unknown", rr.SegmentationImage((~known).view(np.uint8)))
+        log(
+            "camera/improvement/unknown", rr.SegmentationImage((~known).view(np.uint8), opacity=1.0)
+        )
         if self._options.detail:
             log(
                 "camera/improvement/estimate", self._depth_image(_as_depth(improvement.estimate_mm))
@@ -179,17 +196,21 @@ class StepLogger:
 
     def _log_figures(self, step: Step) -> None:
         log = self._stream.log
-        if list(step.stages_ms) != self._stages:
-            self._stages = list(step.stages_ms)
-            log("figures/stages", rr.SeriesLines(names=self._stages), static=True)
         log("figures/stages", rr.Scalars(list(step.stages_ms.values())))
         for name, value in step.figures.items():
             if np.isfinite(value):
                 log(f"figures/{name}", rr.Scalars(value))
 
     def _depth_image(self, depth_mm: npt.NDArray[np.uint16]) -> rr.DepthImage:
-        limits = [float(self._options.near_mm), float(self._options.far_mm)]
-        return rr.DepthImage(depth_mm, meter=1000.0, colormap="viridis", depth_range=limits)
+        return rr.DepthImage(
+            depth_mm, meter=1000.0, colormap="viridis", depth_range=list(self._limits_mm)
+        )
+
+
+def _middle_m(depth_mm: npt.NDArray[np.uint16]) -> float:
+    """Median depth in metres; 2 m without any."""
+    known = depth_mm[depth_mm > 0]
+    return float(np.median(known)) / 1000 if known.size else 2.0
 
 
 def _as_depth(value_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
@@ -208,7 +229,7 @@ def _map_image(
 # How it is laid out
 
 
-def blueprint(*, acquiring: bool, detail: bool) -> rrb.Blueprint:
+def blueprint(*, acquiring: bool, detail: bool, look_at_m: float = 2.0) -> rrb.Blueprint:
     """Layout of the viewer, left to right in the order of the method.
 
     Parameters
@@ -217,14 +238,22 @@ def blueprint(*, acquiring: bool, detail: bool) -> rrb.Blueprint:
         Whether a budget is spent: samples, model and error have views only then.
     detail : bool
         Whether the inner read-outs have views too.
+    look_at_m : float, default 2.0
+        Depth around which the view in space turns, in metres.
     """
 
-    def image(name: str, *entities: str) -> rrb.Spatial2DView:
+    def image(name: str, *entities: str, backdrop: bool = False) -> rrb.Spatial2DView:
         contents = [f"/camera/{entity}" for entity in entities]
-        return rrb.Spatial2DView(origin="/camera", contents=contents, name=name)
+        grey = rr.DepthImage.from_fields(colormap="grayscale")
+        return rrb.Spatial2DView(
+            origin="/camera",
+            contents=contents + ["/camera/depth", "/camera/holes"] * backdrop,
+            overrides={"/camera/depth": grey} if backdrop else None,
+            name=name,
+        )
 
-    gas = image("3a Neural gas", "depth", "gas/mask", "gas/triangles", "gas/nodes")
-    gas_long = image("3a Long edges", "depth", "gas/complement")
+    gas = image("3a Neural gas", "gas/mask", "gas/triangles", "gas/nodes", backdrop=True)
+    gas_long = image("3a Long edges", "gas/complement", backdrop=True)
     score = image("3b Improvement", "improvement/score", "improvement/unknown")
     estimate = image("3b Estimate", "improvement/estimate", "improvement/unknown")
     deviation = image("3b Deviation", "improvement/deviation", "improvement/unknown")
@@ -244,17 +273,25 @@ def blueprint(*, acquiring: bool, detail: bool) -> rrb.Blueprint:
             )
         )
         space.append("/world/samples")
-    columns.append(rrb.Spatial3DView(origin="/", contents=space, name="In space"))
+    eye = rrb.EyeControls3D(
+        position=(-0.55 * look_at_m, -0.5 * look_at_m, -0.6 * look_at_m),
+        look_target=(0, 0, look_at_m),
+        eye_up=(0, -1, 0),
+    )
+    columns.append(rrb.Spatial3DView(origin="/", contents=space, name="In space", eye_controls=eye))
 
     def plot(name: str, *figures: str) -> rrb.TimeSeriesView:
         contents = [f"/figures/{figure}" for figure in figures]
-        return rrb.TimeSeriesView(origin="/figures", contents=contents, name=name)
+        return rrb.TimeSeriesView(
+            origin="/figures", contents=contents, name=name, plot_legend=rrb.Corner2D.LeftTop
+        )
 
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(*columns, column_shares=[1.0] * (len(columns) - 1) + [1.6]),
             rrb.Horizontal(
                 rrb.TextDocumentView(origin="/guide", name="How to read it"),
+                rrb.Spatial2DView(origin="/legend", name="Colours", background=legend.BACKGROUND),
                 plot("Milliseconds per stage", "stages"),
                 rrb.Vertical(
                     plot("Rate and drops", "fps", "dropped_sensor", "dropped_viewer"),
@@ -262,7 +299,7 @@ def blueprint(*, acquiring: bool, detail: bool) -> rrb.Blueprint:
                     row_shares=[2, 1],
                 ),
                 plot("Errors in mm", "quantisation_error_mm", "rmse_mm"),
-                column_shares=[1.3, 1, 1, 1],
+                column_shares=[1.15, 1.15, 1, 0.9, 0.9],
             ),
             row_shares=[2.2, 1],
         ),
@@ -279,9 +316,8 @@ def blueprint(*, acquiring: bool, detail: bool) -> rrb.Blueprint:
 class _Stream:
     """A recording stream of its own: what befalls one sink must not touch another."""
 
-    def __init__(self, options: ViewerOptions, layout: rrb.Blueprint, times: StageTimes) -> None:
+    def __init__(self, options: ViewerOptions, times: StageTimes) -> None:
         self.options = options
-        self.layout = layout
         self._times = times
         self._stream: rr.RecordingStream | None = None
         self._logger: StepLogger | None = None
@@ -310,7 +346,7 @@ class _Stream:
 
     def _begin(self, target: rr.FileSink | rr.GrpcSink | rr.GrpcServerSink) -> None:
         self._stream = rr.RecordingStream(APPLICATION)
-        self._stream.set_sinks(target, default_blueprint=self.layout)
+        self._stream.set_sinks(target)
         self._logger = StepLogger(self._stream, self.options)
 
 
@@ -322,10 +358,8 @@ class FileStream(_Stream):
     failure the file is cut back to there.
     """
 
-    def __init__(
-        self, path: Path, options: ViewerOptions, layout: rrb.Blueprint, times: StageTimes
-    ) -> None:
-        super().__init__(options, layout, times)
+    def __init__(self, path: Path, options: ViewerOptions, times: StageTimes) -> None:
+        super().__init__(options, times)
         self.path = path
         self._sure_bytes = 0
         self._checked_s = time.monotonic()
@@ -378,8 +412,8 @@ class FileStream(_Stream):
 class ServerStream(_Stream):
     """Serves a stream that viewers join, on this machine only unless told otherwise."""
 
-    def __init__(self, options: ViewerOptions, layout: rrb.Blueprint, times: StageTimes) -> None:
-        super().__init__(options, layout, times)
+    def __init__(self, options: ViewerOptions, times: StageTimes) -> None:
+        super().__init__(options, times)
         self.host, self.port = _host_and_port(options.serve_address)
         try:
             with socket.create_server((self.host, self.port)):
@@ -408,10 +442,8 @@ class RemoteStream(_Stream):
         Steps taken while no viewer was there.
     """
 
-    def __init__(
-        self, url: str, options: ViewerOptions, layout: rrb.Blueprint, times: StageTimes
-    ) -> None:
-        super().__init__(options, layout, times)
+    def __init__(self, url: str, options: ViewerOptions, times: StageTimes) -> None:
+        super().__init__(options, times)
         self.url = url
         self.missed = 0
         parts = urlsplit(url)
@@ -456,13 +488,13 @@ class RemoteStream(_Stream):
 class WindowStream(RemoteStream):
     """Opens a viewer window, or uses the one that is open, which outlives this program."""
 
-    def __init__(self, options: ViewerOptions, layout: rrb.Blueprint, times: StageTimes) -> None:
+    def __init__(self, options: ViewerOptions, times: StageTimes) -> None:
         port = VIEWER_PORT
         if options.serve and _host_and_port(options.serve_address)[1] == VIEWER_PORT:
             port += 1
         if not _listens(("127.0.0.1", port)):
             _start_viewer(port, options.viewer_memory)
-        super().__init__(f"rerun+http://127.0.0.1:{port}/proxy", options, layout, times)
+        super().__init__(f"rerun+http://127.0.0.1:{port}/proxy", options, times)
 
 
 _ABANDONED: list[rr.RecordingStream] = []
@@ -534,8 +566,6 @@ class Viewer:
     ----------
     options : ViewerOptions
         Which places.
-    acquiring : bool
-        Whether steps carry an acquisition; it has views then.
     live : bool
         A live source waits for nobody: what a place has no time for is dropped there. A
         recording waits for its file always, and for a viewer that is not stalled.
@@ -548,11 +578,8 @@ class Viewer:
         If a place cannot be written, reached or opened.
     """
 
-    def __init__(
-        self, options: ViewerOptions, *, acquiring: bool, live: bool, times: StageTimes
-    ) -> None:
-        layout = blueprint(acquiring=acquiring, detail=options.detail)
-        shared = options, layout, times
+    def __init__(self, options: ViewerOptions, *, live: bool, times: StageTimes) -> None:
+        shared = options, times
         self.window = not options.headless and has_display()
         streams: list[tuple[str, _Stream]] = []
         if options.save is not None:
@@ -651,7 +678,7 @@ def screenshot(recording: Path, picture: Path, frame: int | None = None) -> None
         ) from None
     try:
         client.open(str(recording.resolve()))
-        time.sleep(3)  # it loads and lays out in its own time and tells nobody when it is done
+        time.sleep(6)  # it loads and lays out in its own time and tells nobody when it is done
         if frame is not None:
             client.set_time("frame", sequence=frame)
             time.sleep(2)
