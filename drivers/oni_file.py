@@ -470,12 +470,12 @@ class _Inspection:
                 )
             elif node.declared_frames != there:
                 self._problem(
-                    node.offset,
+                    self.size,
                     f"{node.declared_frames} {node.name} frames are announced, {there} are there",
                 )
             if node.seek_table_offset and node.declared_frames and not node.has_seek_table:
                 self._problem(
-                    node.offset,
+                    self.size,
                     f"there is no sound seek table of {node.name} at byte {node.seek_table_offset}",
                 )
 
