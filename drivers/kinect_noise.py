@@ -118,6 +118,7 @@ def kinect_depth(
     light = (albedo * FARTHEST_MM**2).astype(np.float32)
     _match(nearness, material, light, parallax, width / 640, camera.fx, strength)
     _measure(nearness, strength, error, wobble, parallax, depth_steps(camera), state, depth_mm)
+    depth_mm[:, width - math.ceil(_BORDER_PX * width / 640) :] = 0
     return depth_mm
 
 
@@ -177,7 +178,6 @@ def _line(nodes, cell, row, line):  # type: ignore[no-untyped-def]
 def _match(nearness, material, light, parallax, scale, focal, strength):  # type: ignore[no-untyped-def]
     """How well each pixel's window matches; 1 is the limit, 0 is hopeless."""
     height, width = nearness.shape
-    border = width - math.ceil(_BORDER_PX * scale)
     steepness = np.float32((parallax / (scale * _STEEPEST)) ** 2)
     lens = np.float32(focal * focal)
     per_q = np.float32(parallax * scale)
@@ -185,9 +185,7 @@ def _match(nearness, material, light, parallax, scale, focal, strength):  # type
     for row in range(height):
         line, out = nearness[row], strength[row]
         above, below = nearness[max(row - 1, 0)], nearness[min(row + 1, height - 1)]
-        out[0] = 0.0
-        out[border:] = 0.0
-        for column in range(1, border):
+        for column in range(1, width - 1):
             q = line[column]
             # The smaller of both differences: a step beside a pixel does not make it steep.
             du = min(abs(line[column + 1] - q), abs(q - line[column - 1]))
@@ -198,6 +196,7 @@ def _match(nearness, material, light, parallax, scale, focal, strength):  # type
             cosine = math.sqrt(square / (square + slope * lens + tiny))
             back = light[material[row, column]] * square * cosine
             out[column] = min(back, one / (slope * steepness + tiny))
+        out[0], out[width - 1] = out[1], out[width - 2]
         # The projector stands to the right: what lies left of a nearer surface is in its shadow.
         lit = np.float32(width)
         for column in range(width - 1, -1, -1):

@@ -47,6 +47,8 @@ class MeshSource(DepthSource):
         Path of a .ply file; options after ``?``, with ``&`` between:
         ``side=front`` (front, back, left, right, top, bottom; y is up, the front towards +z);
         ``size=640x480``, the largest frame;
+        ``focal=585``, focal length in pixels of a 640 pixel wide frame: the longer, the farther
+        the object stands and the more parallel it is seen;
         ``fit=object`` cuts the frame to the object's bounding box, so that a seed lattice lies
         over the object as in Fig. 1 of the paper; ``fit=frame`` keeps the whole frame;
         ``splat=0``, half width in pixels of the square that a point of a file without faces
@@ -66,6 +68,7 @@ class MeshSource(DepthSource):
         options = Options(text, f"'{name}'")
         side = options.choice("side", "front", tuple(SIDES))
         width, height = options.size("size", (640, 480))
+        focal = options.number("focal", 585.0, 100.0, 10_000.0) * width / 640
         fit = options.choice("fit", "object", ("object", "frame"))
         splat = options.integer("splat", 0, 0, 64)
         self.frame_count: int = options.integer("frames", 1, 1, 1_000_000)
@@ -74,7 +77,7 @@ class MeshSource(DepthSource):
         self.fps = 30.0
         self.live = False
         self.dropped = 0
-        camera = Camera.kinect(width, height)
+        camera = Camera(width, height, focal, focal, width / 2, height / 2)
         points_mm, triangles = place(read_ply(Path(name)), side, camera)
         depth_mm = render(points_mm, triangles, camera, splat)
         if not depth_mm.any():

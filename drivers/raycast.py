@@ -24,9 +24,9 @@ QUAD, SPHERE, CYLINDER, DISC, TORUS = range(5)
 NEAREST_MM = 50.0
 """Nothing is seen closer to the camera than this."""
 
-_TORUS_STEPS = 64
+_TORUS_STEPS = 256
 _TORUS_HIT_MM = 0.005
-_TORUS_CLOSE = 0.02  # of the tube's radius: from there on one step of Newton's is exact enough
+_TORUS_CLOSE = 0.005  # of the tube's radius: from there on one step of Newton's is exact enough
 
 
 @dataclass(frozen=True, eq=False)
