@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from dataclasses import asdict, dataclass
 
 from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
+from selective_depth.drivers.openni_list import DeviceInfo
 from selective_depth.drivers.openni_process import Message, Worker, error_of
 from selective_depth.drivers.source import (
     DepthSource,
@@ -100,6 +102,8 @@ class OpenNIDevice(DepthSource):
 
     Attributes
     ----------
+    device : DeviceInfo
+        The sensor that was opened.
     state : str
         ``"live"``, ``"stalled"``, ``"lost"`` or ``"reconnecting"``.
     state_reason : str
@@ -130,7 +134,7 @@ class OpenNIDevice(DepthSource):
         self.misfits = 0
         self.state_reason = ""
         self._wanted_uri = device_uri
-        self._like: list[str] | None = None
+        self.device: DeviceInfo | None = None
         self._changed = threading.Condition()
         self._closing = threading.Event()
         self._newest: tuple[DepthArray, int, int] | None = None
@@ -204,10 +208,9 @@ class OpenNIDevice(DepthSource):
                 f"The sensor {self.uri} is {self.state}: {self.state_reason}. It is opened again"
                 " as soon as it is there."
             )
-        why = f" ({self.state_reason})" if self.state_reason else ""
+        advice = " Check its cable and its power supply." if self.state == "stalled" else ""
         return SourceTimeoutError(
-            f"The sensor {self.uri} gave no frame within {timeout_s:g} s{why}. It is connected;"
-            " check its cable and its power supply."
+            f"The sensor {self.uri} gave no frame within {timeout_s:g} s.{advice}"
         )
 
     def _become(self, state: str, why: str = "") -> None:
@@ -217,7 +220,10 @@ class OpenNIDevice(DepthSource):
     def _open(self, timeout_s: float) -> tuple[Worker, Message]:
         """Start a worker on the sensor and wait until it streams."""
         worker = Worker(
-            "device", uri=self._wanted_uri, like=self._like, settings=asdict(self.settings)
+            "device",
+            uri=self._wanted_uri,
+            like=asdict(self.device) if self.device else None,
+            settings=asdict(self.settings),
         )
         try:
             deadline = time.monotonic() + timeout_s
@@ -230,7 +236,7 @@ class OpenNIDevice(DepthSource):
                             f" {timeout_s:g} s. Pull it out and plug it in again."
                         )
                 elif message["kind"] == "found":
-                    self._like = [message["vendor"], message["name"]]
+                    self.device = DeviceInfo(**message["device"])
                     if self.state == "lost":
                         self._become("reconnecting", "it is there again")
                 elif message["kind"] == "opened":
@@ -248,15 +254,11 @@ class OpenNIDevice(DepthSource):
 
     def _supervise(self) -> None:
         try:
-            while True:
+            while not self._closing.is_set():
                 state, why = self._follow()
-                self._worker.close(_GRACE_S)
-                if self._closing.is_set():
-                    return
                 self._become(state, why)
+                self._worker.close(_GRACE_S)
                 self._reopen()
-        except SourceEndedError:
-            return  # closed while it was being opened
         except BaseException as error:  # noqa: BLE001 - a reader must hear of it, whatever it is
             with self._changed:
                 self._failure = error
@@ -264,34 +266,33 @@ class OpenNIDevice(DepthSource):
 
     def _follow(self) -> tuple[str, str]:
         """Take frames in until something is wrong; return the new state and the reason."""
-        heard = last_frame = time.monotonic()
-        misfits = 0
+        misfits = unheard = 0
         while not self._closing.is_set():
             message = self._worker.receive(_BEAT_S)
-            now = time.monotonic()
+            # Beats, not the clock: if this process was held up, it is not the worker's fault.
+            unheard = unheard + 1 if message is None else 0
             if message is None:
-                if now - heard > _HANG_S:
+                if unheard * _BEAT_S > _HANG_S:
                     return "reconnecting", "OpenNI2 hangs"
-                continue
-            heard = now
-            if message["kind"] == "frame":
-                misfits, last_frame = 0, now
+            elif message["kind"] == "frame":
+                misfits = 0
                 self._arrive(message)
             elif message["kind"] == "misfit":
-                self.misfits += 1
                 misfits += 1
+                self.misfits += 1
                 if misfits >= _MISFITS:
                     return "reconnecting", f"its frames are wrong: {message['problem']}"
+            elif message["kind"] == "idle":
+                if message["silent_s"] > _RESTART_S:
+                    return "reconnecting", f"no frame for {_RESTART_S:g} s"
+                if message["silent_s"] > _STALL_S:
+                    self._become("stalled", "it sends no frames")
             elif message["kind"] == "lost":
                 return "lost", "it was unplugged or lost its power"
             elif message["kind"] == "died":
                 return "reconnecting", message["reason"]
             elif message["kind"] == "error":
                 return "reconnecting", message["message"].rstrip(".")
-            if now - last_frame > _RESTART_S:
-                return "reconnecting", f"no frame for {_RESTART_S:g} s"
-            if now - last_frame > _STALL_S:
-                self._become("stalled", "it sends no frames")
         return "lost", "closed"
 
     def _arrive(self, message: Message) -> None:
@@ -306,21 +307,17 @@ class OpenNIDevice(DepthSource):
 
     def _reopen(self) -> None:
         """Open the sensor again, trying for as long as it takes."""
-        attempt = 0
-        while True:
-            if self._closing.wait(_BACK_OFF_S[min(attempt, len(_BACK_OFF_S) - 1)]):
-                raise SourceEndedError(f"{self.uri} has been closed.")
-            attempt += 1
+        pauses_s = itertools.chain(_BACK_OFF_S, itertools.repeat(_BACK_OFF_S[-1]))
+        for pause_s in pauses_s:
+            if self._closing.wait(pause_s):
+                return
             try:
-                self._worker, about = self._open(self._reopen_s)
+                self._worker, _ = self._open(self._reopen_s)
             except SourceNotFoundError as error:
                 self._become("lost", str(error).rstrip("."))
-            except SourceEndedError:
-                raise
             except SourceError as error:
                 self._become("reconnecting", str(error).rstrip("."))
             else:
-                if (about["width"], about["height"]) == (self.camera.width, self.camera.height):
-                    break
-        self.restarts += 1
-        self._count.restart()
+                self.restarts += 1
+                self._count.restart()
+                return

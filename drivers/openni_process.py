@@ -21,6 +21,7 @@ import numpy as np
 from selective_depth.drivers import source
 from selective_depth.drivers.frame import DepthArray
 from selective_depth.drivers.openni_runtime import find_runtime
+from selective_depth.drivers.openni_usb import usb_advice
 from selective_depth.drivers.source import SourceError
 
 Message = dict[str, Any]
@@ -42,7 +43,11 @@ _ERRORS: dict[str, type[SourceError]] = {
 
 def error_of(message: Message) -> SourceError:
     """The named error that an ``error`` message stands for."""
-    return _ERRORS[message["error"]](message["message"])
+    text = str(message["message"])
+    if message["on_usb"]:
+        advice = usb_advice(find_runtime().drivers)
+        text += " " + (advice or "Plug it in (a Kinect: its power supply too), and try again.")
+    return _ERRORS[message["error"]](text)
 
 
 class Worker:

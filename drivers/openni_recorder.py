@@ -98,6 +98,7 @@ def record(
             like=None,
             settings=asdict(settings or DeviceSettings()),
             file=file,
+            path=str(unborn),
             frames=frames,
             duration_s=duration_s,
             stall_s=_STALL_S,

@@ -15,7 +15,6 @@ import mmap
 import os
 import queue
 import signal
-import stat
 import sys
 import threading
 import time
@@ -35,11 +34,15 @@ NO_GROWTH_S = 1.5  # a frame takes some 100 kB: a file that stops growing is not
 
 
 class JobError(Exception):
-    """Ends the job; `kind` is the name of the error that the parent raises."""
+    """Ends the job; `kind` is the name of the error that the parent raises.
 
-    def __init__(self, kind: str, message: str) -> None:
+    With `on_usb`, what the USB bus says of the sensor would help.
+    """
+
+    def __init__(self, kind: str, message: str, on_usb: bool = False) -> None:
         super().__init__(message)
         self.kind = kind
+        self.on_usb = on_usb
 
 
 class Device(openni2.Device):  # type: ignore[misc]
@@ -172,14 +175,15 @@ def devices() -> list[dict[str, Any]]:
     return found
 
 
-def choose(found: list[dict[str, Any]], wanted: str, like: list[str] | None) -> dict[str, Any]:
+def choose(found: list[dict[str, Any]], wanted: str, like: dict[str, Any] | None) -> dict[str, Any]:
     """The device to open: the one named, the only one, or one like the one that was lost."""
     named = [device for device in found if device["uri"] == wanted]
     if named:
         return named[0]
     if like is not None:
         # Plugged in again, a USB sensor comes back under another address.
-        found = [device for device in found if [device["vendor"], device["name"]] == like]
+        kind = like["vendor"], like["name"]
+        found = [device for device in found if (device["vendor"], device["name"]) == kind]
         wanted = ""
     uris = ", ".join(device["uri"] for device in found) or "none"
     if wanted:
@@ -188,7 +192,7 @@ def choose(found: list[dict[str, Any]], wanted: str, like: list[str] | None) -> 
             f"There is no sensor '{wanted}'. Connected: {uris}.",
         )
     if not found:
-        raise JobError("SourceNotFoundError", "No depth sensor is connected.")
+        raise JobError("SourceNotFoundError", "OpenNI2 finds no depth sensor.", on_usb=True)
     if len(found) > 1:
         raise JobError(
             "SourceNotFoundError",
@@ -223,7 +227,7 @@ class LiveStream:
 
     def __init__(self, job: dict[str, Any], parent: Parent) -> None:
         self.info = choose(devices(), job["uri"], job["like"])
-        parent.send("found", **self.info)
+        parent.send("found", device=self.info)
         uri = self.info["uri"]
         self.watch = Watch(uri)
         try:
@@ -232,8 +236,8 @@ class LiveStream:
             raise JobError(
                 "DeviceRefusedError",
                 f"The sensor {uri} is there but cannot be opened: {reason(error)}. Another program"
-                " may hold it (close that program), or you may not use it (install the udev"
-                " rules of libopenni2-0, then plug it in again).",
+                " may hold it.",
+                on_usb=True,
             ) from error
         if not self.device.has_sensor(openni2.SENSOR_DEPTH):
             raise JobError("DeviceRefusedError", f"The sensor {uri} has no depth camera.")
@@ -355,14 +359,16 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
     live.start()
     parent.send("opened", **about)
     width, height = about["width"], about["height"]
+    last_frame = time.monotonic()
     while not parent.stop.is_set():
         if live.watch.lost.is_set():
             parent.send("lost")
             break
         frame = next_frame(live.stream)
         if frame is None:
-            parent.send("idle")
+            parent.send("idle", silent_s=time.monotonic() - last_frame)
             continue
+        last_frame = time.monotonic()
         problem = misfit(frame, width, height)
         slot = None if problem else slots.take(wait=False)
         if slot is not None:
@@ -374,22 +380,21 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
     live.close()
 
 
-def open_recording(path: str) -> bytes:
-    """The name under which OpenNI2 can open a recording, whatever its path is like."""
-    if not sys.platform.startswith("linux"):
-        if not path.isascii() or len(path) > 255:
-            raise JobError(
-                "SourceNotFoundError",
-                f"OpenNI2 cannot open '{path}' on this system: the path must be ASCII and at most"
-                " 255 letters. Move the file.",
-            )
-        return path.encode()
-    # A byte above 127 in a path crashes the runtime, 1000 bytes abort it, a FIFO hangs it.
-    # Through its descriptor any file opens, and each reader gets a player of its own.
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        raise JobError("DamagedRecordingError", f"'{path}' is not a regular file.")
-    return b"/proc/self/fd/%d" % descriptor
+def native_name(descriptor: int, path: str) -> bytes:
+    """The name under which OpenNI2 can open a file that is open here, whatever its path is like.
+
+    A byte above 127 in a path crashes the runtime and 1000 bytes abort it. Through its descriptor
+    any file opens, and each reader of a recording gets a player of its own.
+    """
+    if os.path.isdir("/proc/self/fd"):  # noqa: PTH112 - pathlib would be all it is imported for
+        return b"/proc/self/fd/%d" % descriptor
+    if not path.isascii() or len(path) > 255:
+        raise JobError(
+            "SourceNotFoundError",
+            f"OpenNI2 cannot open '{path}' on this system: the path must be ASCII and at most 255"
+            " letters. Move the file.",
+        )
+    return path.encode()
 
 
 def run_recording(job: dict[str, Any], parent: Parent) -> None:
@@ -405,7 +410,9 @@ def run_recording(job: dict[str, Any], parent: Parent) -> None:
     initialize(job)
     slots = Slots(job, parent)
     try:
-        device = Device(open_recording(path))
+        # O_NONBLOCK: should the file have become a pipe since it was checked, nothing waits.
+        file = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+        device = Device(native_name(file, path))
         stream = device.create_depth_stream()
     except OSError as error:
         raise JobError(
@@ -516,7 +523,7 @@ def run_record(job: dict[str, Any], parent: Parent) -> None:
     """Record a live sensor until enough, told to stop, or something is wrong."""
     initialize(job)
     live = LiveStream(job, parent)
-    recorder = openni2.Recorder(b"/proc/self/fd/%d" % job["file"])
+    recorder = openni2.Recorder(native_name(job["file"], job["path"]))
     recorder.attach(live.stream, False)
     recorder.start()
     wait_until_recording(job["file"])
@@ -565,11 +572,12 @@ def main() -> None:
     try:
         JOBS[job["job"]](job, parent)
     except JobError as error:
-        parent.send("error", error=error.kind, message=str(error))
+        parent.send("error", error=error.kind, message=str(error), on_usb=error.on_usb)
     except BrokenPipeError:
         pass  # The parent is gone: there is nobody left to tell.
     except Exception as error:  # noqa: BLE001 - the parent turns it into a named error
-        parent.send("error", error="DeviceLostError", message=f"{type(error).__name__}: {error}")
+        kind = "DamagedRecordingError" if job["job"] == "recording" else "DeviceLostError"
+        parent.send("error", error=kind, message=f"OpenNI2 failed: {reason(error)}.", on_usb=False)
     # What is needed is closed. The library's own clean-up at exit can crash or hang.
     os._exit(0)
 

@@ -223,7 +223,7 @@ def test_it_comes_back_under_another_address(virtual_sensor: VirtualSensor) -> N
 @pytest.mark.parametrize(
     ("fault", "error", "message"),
     [
-        ({"connected": 0}, SourceNotFoundError, "No depth sensor"),
+        ({"connected": 0}, SourceNotFoundError, r"finds no depth sensor.*power supply"),
         ({"devices": 2}, SourceNotFoundError, r"2 sensors .*virtual://0, virtual://1.* openni:v"),
         ({"refuse_open": 1}, DeviceRefusedError, "told to refuse"),
         ({"refuse_stream": 1}, DeviceRefusedError, "refuses a depth stream"),

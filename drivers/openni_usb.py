@@ -1,0 +1,81 @@
+"""What the USB bus says of a sensor that OpenNI2 does not find or open."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from pathlib import Path
+
+_KINECT_CAMERA = (0x045E, 0x02AE)
+_KINECT_MOTORS = ((0x045E, 0x02B0), (0x045E, 0x02C2))
+_NAMES = {
+    _KINECT_CAMERA: "Kinect for Xbox 360",
+    (0x045E, 0x02BF): "Kinect for Windows",
+    (0x045E, 0x02C4): "Kinect for Xbox One",
+    (0x045E, 0x02D8): "Kinect for Xbox One",
+    (0x1D27, 0x0600): "PrimeSense sensor",  # as built into the ASUS Xtion, too
+    (0x1D27, 0x0601): "PrimeSense sensor",
+    (0x1D27, 0x0609): "PrimeSense sensor",
+}
+_DRIVERS = {  # OpenNI2's driver for it, and where it comes from
+    "Kinect for Xbox 360": ("FreenectDriver", "build libfreenect's, as the README says"),
+    "Kinect for Windows": ("FreenectDriver", "build libfreenect's, as the README says"),
+    "Kinect for Xbox One": ("freenect2", "build libfreenect2's"),
+    "PrimeSense sensor": ("PS1080", "install the runtime again"),
+}
+
+
+def usb_advice(
+    drivers: Collection[str],
+    bus: Path = Path("/sys/bus/usb/devices"),
+    nodes: Path = Path("/dev/bus/usb"),
+) -> str:
+    """What to do about a sensor that is plugged in but not found, or not opened.
+
+    Parameters
+    ----------
+    drivers : collection of str
+        The drivers of the OpenNI2 runtime.
+    bus, nodes : Path, optional
+        Where Linux describes its USB devices, and where they are opened.
+
+    Returns
+    -------
+    str
+        One or two sentences; empty where the bus tells nothing (as on other systems).
+    """
+    found = _devices(bus, nodes)
+    for number, name in _NAMES.items():
+        if number not in found:
+            continue
+        driver, remedy = _DRIVERS[name]
+        if not any(driver.lower() in one.lower() for one in drivers):
+            having = ", ".join(sorted(drivers)) or "none"
+            return (
+                f"A {name} is on the USB bus, but OpenNI2 has no driver for it (it has: {having}):"
+                f" {remedy}."
+            )
+        if not os.access(found[number], os.R_OK | os.W_OK):
+            return (
+                f"A {name} is on the USB bus, but you may not use it ({found[number]}): install"
+                " the udev rules of libopenni2-0 or libfreenect, then plug it in again."
+            )
+        return f"A {name} is on the USB bus: close the program that uses it, or plug it in again."
+    if any(motor in found for motor in _KINECT_MOTORS):
+        return "A Kinect's motor is on the USB bus but not its camera: plug in its power supply."
+    return ""
+
+
+def _devices(bus: Path, nodes: Path) -> dict[tuple[int, int], Path]:
+    """Vendor and product number of every USB device, and the node that opens it."""
+    found = {}
+    for device in bus.glob("*"):
+        try:
+            vendor, product = (
+                int((device / name).read_text(), 16) for name in ("idVendor", "idProduct")
+            )
+            place = [int((device / name).read_text()) for name in ("busnum", "devnum")]
+        except (OSError, ValueError):
+            continue  # an interface, or it was pulled out just now
+        found[vendor, product] = nodes / f"{place[0]:03}" / f"{place[1]:03}"
+    return found
