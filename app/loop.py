@@ -15,7 +15,6 @@ from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import Acquisition, acquire
 from selective_depth.selectors.improvement import ImprovementSelector
 from selective_depth.selectors.neural_gas import NeuralGasSelector
-from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.regions import RegionSelection
 from selective_depth.selectors.seeds import SeedGrid
 
@@ -107,8 +106,7 @@ class Loop:
 
     def _made(self, frame: DepthFrame, acquisition: Acquisition) -> Model:
         with self.times.stage("model"):
-            hit = acquisition.depth_mm > 0
-            depth_mm = reconstruct(acquisition.uv[hit], acquisition.depth_mm[hit], frame.shape)
+            depth_mm = acquisition.reconstruct()
             error_mm = np.abs(depth_mm - frame.depth_mm.astype(np.float32))
             error_mm[frame.depth_mm == 0] = np.nan
             known = error_mm[frame.depth_mm > 0]

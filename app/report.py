@@ -81,7 +81,7 @@ def count_samples(step: Step) -> int:
     """Measurements of a step that returned depth, seeds included."""
     if step.acquisition is None:
         return int(step.seeds.valid.sum())
-    return int((step.acquisition.depth_mm > 0).sum())
+    return int(step.acquisition.returned.sum())
 
 
 def say(sentence: str) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -16,6 +18,7 @@ from selective_depth.app.realtime import RealtimeSource
 from selective_depth.app.report import RunReport, count_samples, print_report, save_settings, say
 from selective_depth.app.settings import Settings, ViewerOptions
 from selective_depth.app.step import StateNote, Step
+from selective_depth.app.stills import StillRow, contact_sheet, save_png
 from selective_depth.app.viewer import Viewer, has_display
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.source import (
@@ -28,6 +31,8 @@ from selective_depth.drivers.source import (
 )
 
 OK, FAILED, INTERRUPTED = 0, 1, 130
+LEAVE_S = 2.8
+"""How long after Ctrl-C the program is gone at the latest."""
 POLL_S = 0.5
 """How long a live sensor may be silent before its state is shown."""
 
@@ -48,7 +53,6 @@ def watch(uri: str, settings: Settings) -> int:
         Exit code: 0, 1 if something that was asked for failed, 130 after Ctrl-C.
     """
     check(settings)
-    settings = dataclasses.replace(settings, viewer=_with_a_place(settings.viewer, uri))
     session = Session(uri, settings)
     code = session.run()
     print_report(session.report)
@@ -119,19 +123,22 @@ class Session:
         int
             Exit code, as for `watch`.
         """
-        settings, report = self.settings, self.report
+        report = self.report
+        code = OK
         with ExitStack() as stack:
             with waiting(f"Opening {self._uri}"):
                 source = stack.enter_context(open_source(self._uri))
-            if settings.run.realtime and not source.live:
+            if self.settings.run.realtime and not source.live:
                 source = stack.enter_context(RealtimeSource(source))
             report.live = source.live
-            loop = stack.enter_context(Loop(settings, every_model=not source.live))
-            viewer = Viewer(settings.viewer, live=source.live, times=loop.times)
+            seen = _with_a_place(self.settings.viewer, self._uri)
+            self.settings = dataclasses.replace(self.settings, viewer=seen)
+            loop = stack.enter_context(Loop(self.settings, every_model=not source.live))
+            viewer = Viewer(seen, live=source.live, times=loop.times)
             try:
                 self._turn_all(source, loop, viewer)
-                code = OK
             except KeyboardInterrupt:
+                _leave_soon()
                 code = INTERRUPTED
             except DamagedRecordingError as error:
                 report.troubles.append(str(error))
@@ -141,7 +148,8 @@ class Session:
                 report.missed = viewer.dropped
                 report.dropped = source.dropped
                 report.stages = loop.times.summary()
-        self._write_beside()
+            if seen.save is not None and self.last is not None:
+                self._write_beside(seen.save, picture=not viewer.window)
         return code
 
     def _turn_all(self, source: DepthSource, loop: Loop, viewer: Viewer) -> None:
@@ -198,15 +206,29 @@ class Session:
             figures["rmse_mm"] = step.model.rmse_mm
         viewer.show(dataclasses.replace(step, stages_ms=loop.times.last_ms(), figures=figures))
 
-    def _write_beside(self) -> None:
-        """Settings and, where nothing was seen live, a picture, beside the file saved."""
-        path = self.settings.viewer.save
-        if path is None or self.report.frames == 0:
-            return
-        self.report.written.append(path)
-        settings_path = path.with_suffix(".toml")
-        save_settings(settings_path, self.settings, self._uri)
-        self.report.written.append(settings_path)
+    def _write_beside(self, saved: Path, *, picture: bool) -> None:
+        """Settings and, where no window showed it, a picture of the last frame."""
+        beside = [saved, saved.with_suffix(".toml")]
+        save_settings(beside[1], self.settings, self._uri)
+        if picture and self.last is not None:
+            step = self.last
+            row = StillRow(
+                f"{self._uri}, frame {step.frame.index}",
+                step.frame,
+                step.regions,
+                step.improvement,
+                step.acquisition,
+            )
+            beside.append(saved.with_suffix(".png"))
+            save_png(beside[2], contact_sheet([row]))
+        self.report.written += beside
+
+
+def _leave_soon() -> None:
+    """See to it that Ctrl-C ends the program, even if a thread is busy compiling."""
+    watchdog = threading.Timer(LEAVE_S, os._exit, (INTERRUPTED,))
+    watchdog.daemon = True
+    watchdog.start()
 
 
 def _state(source: DepthSource) -> str:
