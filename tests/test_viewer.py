@@ -1,0 +1,235 @@
+"""The viewer: what is logged reads back exactly, and nobody ever waits for a dead one."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import socket
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from selective_depth.app import legend, viewer
+from selective_depth.app.errors import ViewerError
+from selective_depth.app.settings import ViewerOptions
+from selective_depth.app.step import Model, StateNote, Step
+from selective_depth.app.timing import STAGES, StageTimes
+from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.source import OutputError
+from selective_depth.selectors.acquire import Acquisition, Round
+from selective_depth.selectors.improvement import ImprovementSelection
+from selective_depth.selectors.regions import delaunay_regions
+from selective_depth.selectors.seeds import SeedGrid
+
+HEIGHT, WIDTH = 48, 64
+HEADLESS = ViewerOptions(headless=True)
+
+
+def make_step(index: int, *, acquiring: bool = True) -> Step:
+    """A small step with holes, made by hand: the viewer is tested, not the selectors."""
+    rng = np.random.default_rng(index)
+    depth_mm = rng.integers(600, 4000, (HEIGHT, WIDTH)).astype(np.uint16)
+    depth_mm[5:12, 20:30] = 0
+    camera = Camera.kinect(WIDTH, HEIGHT)
+    frame = DepthFrame(depth_mm, index, 1_000_000 + index * 33_333, camera, "made/by hand")
+    seeds = SeedGrid.from_frame(frame, (12, 16))
+    known = depth_mm > 0
+    score = np.where(known, rng.random((HEIGHT, WIDTH)), 0).astype(np.float32)
+    improvement = ImprovementSelection(
+        mask=score > 0.9,
+        score=score,
+        name="improvement",
+        estimate_mm=np.where(known, depth_mm, np.nan).astype(np.float32),
+        variance_mm2=np.where(known, 4.0, np.nan).astype(np.float32),
+        known=known,
+        raw=score,
+    )
+    regions = delaunay_regions(seeds.points_mm, seeds.uv.astype(np.float32), (HEIGHT, WIDTH))
+    acquisition = model = None
+    if acquiring:
+        uv = np.array([[3, 4], [25, 7], [50, 40]], dtype=np.int32)
+        acquisition = Acquisition(
+            uv=np.vstack((seeds.lattice_uv.reshape(-1, 2), uv)),
+            depth_mm=np.concatenate((seeds.depth_mm.ravel().astype(np.uint16), frame.measure(uv))),
+            round=np.array([0] * seeds.depth_mm.size + [1, 1, 2], dtype=np.uint8),
+            frame_shape=(HEIGHT, WIDTH),
+            rounds=(Round(2, 1), Round(1, 1)),
+        )
+        error_mm = np.where(known, 12.5, np.nan).astype(np.float32)
+        model = Model(depth_mm.astype(np.float32), error_mm, 12.5)
+    return Step(
+        frame,
+        seeds,
+        regions,
+        improvement,
+        acquisition,
+        model,
+        stages_ms=dict.fromkeys(STAGES, 1.0),
+        figures=dict.fromkeys(legend.FIGURES, 2.0),
+    )
+
+
+def save(path: Path, steps: list[Step], **options: Any) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=path, **options)
+    shown = viewer.Viewer(chosen, live=False, times=StageTimes())
+    for step in steps:
+        shown.show(step)
+    assert shown.close() == []
+    assert sum(shown.dropped.values()) == 0
+
+
+def rows_of(path: Path) -> dict[str, int]:
+    """Rows that carry data, by entity; static ones included."""
+    rows: dict[str, int] = {}
+    for chunk in RrdReader(str(path)).stream():
+        rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+    return rows
+
+
+def images_of(path: Path, entity: str, dtype: type[np.generic]) -> list[np.ndarray]:
+    """Images of an entity in the order of its frames, as they lie in the file."""
+    found = {}
+    for chunk in RrdReader(str(path)).stream():
+        if chunk.entity_path != entity or chunk.is_static:
+            continue
+        batch = chunk.to_record_batch()
+        buffer = next(n for n in batch.schema.names if n.endswith(":buffer"))
+        for frame, data in zip(
+            batch.column("frame").to_pylist(), batch.column(buffer), strict=True
+        ):
+            pixels = np.asarray(data.values.flatten())
+            found[frame] = pixels.view(dtype).reshape(HEIGHT, WIDTH)
+    return [found[frame] for frame in sorted(found)]
+
+
+def views_of(part: Any) -> list[Any]:
+    """All views in a blueprint."""
+    children = getattr(part, "contents", None) or []
+    if hasattr(part, "root_container"):
+        return views_of(part.root_container)
+    if hasattr(part, "class_identifier") or isinstance(children, str):
+        return [part]
+    return [view for child in children for view in views_of(child)]
+
+
+def test_file_holds_every_step_bit_for_bit(tmp_path: Path) -> None:
+    steps = [make_step(index) for index in range(12)]
+    save(tmp_path / "out.rrd", steps)
+    depths = images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)
+    masks = images_of(tmp_path / "out.rrd", "/camera/gas/mask", np.uint8)
+    maps = images_of(tmp_path / "out.rrd", "/camera/improvement/score", np.uint8)
+    assert len(depths) == len(masks) == len(maps) == len(steps)
+    for step, depth, mask, levels in zip(steps, depths, masks, maps, strict=True):
+        np.testing.assert_array_equal(depth, step.frame.depth_mm)
+        np.testing.assert_array_equal(mask != 0, step.regions.mask)
+        np.testing.assert_array_equal(levels != 0, step.improvement.known)
+        shown = (levels.astype(np.float32) - 1) / 254
+        known = step.improvement.known
+        assert np.abs(shown[known] - step.improvement.score[known]).max() <= 1 / 254
+
+
+@pytest.mark.parametrize("detail", [False, True])
+@pytest.mark.parametrize("acquiring", [False, True])
+def test_every_view_shows_something_that_was_logged(
+    tmp_path: Path, acquiring: bool, detail: bool
+) -> None:
+    save(tmp_path / "out.rrd", [make_step(0, acquiring=acquiring)], detail=detail)
+    logged = rows_of(tmp_path / "out.rrd")
+    views = views_of(viewer.blueprint(acquiring=acquiring, detail=detail))
+    assert len(views) >= (11 if acquiring else 8)
+    for view in views:
+        contents = view.contents
+        if isinstance(contents, str):
+            contents = [str(contents).replace("$origin", str(view.origin).rstrip("/"))]
+        for path in contents:
+            inside = [entity for entity in logged if entity.startswith(path.removesuffix("/**"))]
+            assert inside, f"view '{view.name}' shows {path}, which nobody logs"
+
+
+def test_sensor_state_is_logged_when_it_changes(tmp_path: Path) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    shown = viewer.Viewer(chosen, live=False, times=StageTimes())
+    shown.show(StateNote("lost"))  # before the first frame there is no time to log it at
+    shown.show(make_step(0))
+    for state in ("stalled", "stalled", "lost", "reconnecting"):
+        shown.show(StateNote(state))
+    shown.show(make_step(1))
+    assert shown.close() == []
+    states = []
+    for chunk in RrdReader(str(tmp_path / "out.rrd")).stream():
+        if chunk.entity_path == "/sensor/state" and not chunk.is_static:
+            column = chunk.to_record_batch().column("StateChange:state")
+            states += [value for row in column.to_pylist() for value in row]
+    assert states == ["replay", "stalled", "lost", "reconnecting", "replay"]
+
+
+def test_colour_limits_hold_for_the_whole_run(tmp_path: Path) -> None:
+    near, far = dataclasses.replace(HEADLESS, near_mm=700, far_mm=4200), make_step(1)
+    save(tmp_path / "out.rrd", [make_step(0), far], near_mm=near.near_mm, far_mm=near.far_mm)
+    ranges = set()
+    for chunk in RrdReader(str(tmp_path / "out.rrd")).stream():
+        if chunk.entity_path == "/camera/depth":
+            for row in chunk.to_record_batch().column("DepthImage:depth_range").to_pylist():
+                ranges.add(tuple(row[0]))
+    assert ranges == {(700.0, 4200.0)}
+
+
+@pytest.mark.parametrize("place", ["missing/out.rrd", ".", "/proc/out.rrd"])
+def test_unwritable_file_is_refused_at_once(tmp_path: Path, place: str) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / place)
+    with pytest.raises(OutputError, match="cannot write"):
+        viewer.Viewer(chosen, live=False, times=StageTimes())
+
+
+def test_full_disk_ends_the_file_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    shown = viewer.Viewer(chosen, live=False, times=StageTimes())
+    usage = shutil.disk_usage(tmp_path)
+    room = iter([1 << 30] * 3)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=next(room, 1 << 20)))
+    with pytest.raises(OutputError, match="disk is full"):
+        for index in range(100):
+            shown.show(make_step(index))
+    shown.close()
+    depths = images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)
+    assert len(depths) == 3
+    for index, depth in enumerate(depths):
+        np.testing.assert_array_equal(depth, make_step(index).frame.depth_mm)
+
+
+@pytest.mark.parametrize(
+    "url", ["http://127.0.0.1:9876", "127.0.0.1:9876", "rerun+http:///proxy", "rubbish"]
+)
+def test_address_that_is_none_is_refused(url: str) -> None:
+    with pytest.raises(ViewerError, match="no viewer's address"):
+        viewer.Viewer(dataclasses.replace(HEADLESS, connect=url), live=True, times=StageTimes())
+
+
+def test_absent_viewer_is_noticed_at_once() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    chosen = dataclasses.replace(HEADLESS, connect=f"rerun+http://127.0.0.1:{port}/proxy")
+    start_s = time.monotonic()
+    with pytest.raises(ViewerError, match="no viewer listens"):
+        viewer.Viewer(chosen, live=True, times=StageTimes())
+    assert time.monotonic() - start_s < 2
+
+
+@pytest.mark.parametrize("address", ["9876", "localhost:", "localhost:99999", ":1"])
+def test_serve_address_is_checked(address: str) -> None:
+    chosen = dataclasses.replace(HEADLESS, serve=True, serve_address=address)
+    with pytest.raises(ViewerError, match="no address"):
+        viewer.Viewer(chosen, live=True, times=StageTimes())
+
+
+def test_taken_port_is_refused() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        chosen = dataclasses.replace(
+            HEADLESS, serve=True, serve_address=f"127.0.0.1:{taken.getsockname()[1]}"
+        )
+        with pytest.raises(ViewerError, match="cannot serve"):
+            viewer.Viewer(chosen, live=True, times=StageTimes())
