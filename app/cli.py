@@ -20,7 +20,13 @@ from selective_depth.app.command import (
     settings_arguments,
 )
 from selective_depth.app.errors import AppError, UsageError
-from selective_depth.app.settings import Settings
+from selective_depth.app.settings import (
+    AcquireOptions,
+    GasOptions,
+    ImprovementOptions,
+    SeedOptions,
+    Settings,
+)
 
 OK, FAILED, MISUSED, INTERRUPTED = 0, 1, 2, 130
 
@@ -129,6 +135,61 @@ def devices() -> int:
 
 
 @command(
+    "Files",
+    (f"{PROGRAM} check walk.oni", "what is wrong with it and where, how much is readable"),
+    (f"{PROGRAM} check walk.oni --repair whole.oni", "and save what is readable"),
+)
+def check(
+    file: Annotated[Path, arg(metavar="FILE.oni")],
+    /,
+    repair: Annotated[Path | None, arg(metavar="OUT.oni")] = None,
+    timeout: Annotated[float, arg(metavar="SECONDS")] = 10.0,
+) -> int:
+    """Say whether a recording is whole; needs no OpenNI2.
+
+    Parameters
+    ----------
+    file : Path
+        The recording.
+    repair : Path
+        Write what is readable to this new file, which OpenNI2 replays.
+    timeout : float
+        Look at it for so long at most.
+    """
+    from selective_depth.app.files import check_file
+
+    return check_file(file, repair=repair, timeout_s=timeout)
+
+
+@command(
+    "Files",
+    (f"{PROGRAM} export walk.oni frames/", "as 16-bit PNG files; all that is readable"),
+    (f"{PROGRAM} export frames/ walk.oni", "an .oni file out of PNG files"),
+    (f"{PROGRAM} export virtual:ball ball.oni --frames 90", "of any source"),
+)
+def export(
+    source: Source,
+    out: Annotated[Path, arg(metavar="OUT")],
+    /,
+    frames: Annotated[int | None, arg(metavar="N")] = None,
+) -> int:
+    """Save the frames of a source as PNG files, or as an .oni file; needs no OpenNI2.
+
+    Parameters
+    ----------
+    source : str
+        Anything that 'replay' takes.
+    out : Path
+        A new folder for PNG files and their sidecar, or a new file that ends in .oni.
+    frames : int
+        Stop after this many frames.
+    """
+    from selective_depth.app.files import export as save
+
+    return save(source, out, frames)
+
+
+@command(
     "Pictures",
     (f"{PROGRAM} screenshot out.rrd out.png", "the viewer on a recording that --save wrote"),
 )
@@ -155,6 +216,83 @@ def screenshot(
     viewer.screenshot(recording, picture, frame)
     say(f"wrote {picture}")
     return OK
+
+
+@command(
+    "Pictures",
+    (f"{PROGRAM} snapshot walk.oni --frame 30", "one frame, all panels, no viewer needed"),
+    (
+        f"{PROGRAM} snapshot virtual:workstation virtual:ball virtual:firehose",
+        "the paper's Fig. 5",
+    ),
+    (f"{PROGRAM} snapshot frames/ --budget 0.05 --out pictures", "with what was acquired"),
+)
+def snapshot(
+    sources: Annotated[tuple[str, ...], arg(metavar="SOURCE...")],
+    /,
+    out: Annotated[Path, arg(metavar="DIR")] = Path("snapshot"),
+    frame: Annotated[int, arg(metavar="N")] = 0,
+    seeds: SeedOptions = DEFAULTS.seeds,
+    gas: GasOptions = DEFAULTS.gas,
+    improvement: ImprovementOptions = DEFAULTS.improvement,
+    acquire: Annotated[AcquireOptions, arg(name="")] = DEFAULTS.acquire,
+) -> None:
+    """Write a contact sheet of one frame of each source, and every panel alone, as PNG.
+
+    Parameters
+    ----------
+    sources : tuple of str
+        Recordings, folders or scenes, as for replay; one row of the sheet each.
+    out : Path
+        Folder for the pictures.
+    frame : int
+        Which frame of each source, from 0.
+    seeds, gas, improvement, acquire
+        Options of the selectors.
+    """
+    from selective_depth.app.progress import waiting
+    from selective_depth.app.snapshot import snapshot as make_stills
+
+    if frame < 0:
+        raise UsageError(f"--frame is {frame}; frames count from 0.")
+    settings = Settings(seeds=seeds, gas=gas, improvement=improvement, acquire=acquire)
+    with waiting("Running both selectors"):
+        written = make_stills(sources, frame, out, settings)
+    print(f"wrote {written[0]} and {len(written) - 1} single panels beside it")
+
+
+@command(
+    "Compare",
+    (f"{PROGRAM} bench", "every stage on the bundled recording"),
+    (f"{PROGRAM} bench frames/ --json out.json", "on your own, to a file as well"),
+)
+def bench(
+    source: Annotated[str, arg(metavar="SOURCE")] = "",
+    /,
+    frames: Annotated[int | None, arg(metavar="N")] = None,
+    json: Annotated[Path | None, arg(metavar="FILE")] = None,
+    page: Annotated[Path | None, arg(metavar="FILE.md")] = None,
+    peers: bool = True,
+) -> None:
+    """Time every stage of the loop, and the same work in other libraries, on this machine.
+
+    Parameters
+    ----------
+    source : str
+        As for replay; by default the bundled recording.
+    frames : int
+        Time at most this many frames.
+    json : Path
+        Write the figures to a file as well.
+    page : Path
+        Write the benchmark page of the documentation.
+    peers : bool
+        Time the peers that are installed (pip install 'selective-depth[bench]').
+    """
+    from selective_depth.app.bench_report import run_bench
+    from selective_depth.app.samples import bundled_recording
+
+    run_bench(source or bundled_recording(), frames, json=json, page=page, peers=peers)
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -17,7 +17,6 @@ import numpy.typing as npt
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import Acquisition
 from selective_depth.selectors.improvement import ImprovementSelection
-from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.regions import RegionSelection
 
 Image = npt.NDArray[np.uint8]
@@ -133,9 +132,9 @@ def regions_panel(frame: DepthFrame, regions: RegionSelection) -> Panel:
     share = float(regions.mask.mean())
     return Panel(
         "neural-gas",
-        f"Neural gas: {len(regions.nodes_uv):,} nodes, kept triangles",
+        "Neural gas regions",
         image,
-        note=f"{share:.0%} of the image kept",
+        note=f"{len(regions.nodes_uv):,} nodes, {share:.0%} kept",
     )
 
 
@@ -145,11 +144,11 @@ def improvement_panel(improvement: ImprovementSelection) -> Panel:
     image = _hatched(image, ~improvement.known)
     return Panel(
         "improvement",
-        "Improvement map, eq. (23)",
+        "Improvement map",
         image,
         cv2.COLORMAP_INFERNO,
         ("0", "1"),
-        "most to gain at 1",
+        "eq. (23)",
     )
 
 
@@ -173,8 +172,7 @@ def samples_panel(frame: DepthFrame, acquisition: Acquisition) -> Panel:
 
 def error_panel(frame: DepthFrame, acquisition: Acquisition) -> Panel:
     """How far the model made of all samples is from the full frame."""
-    hit = acquisition.depth_mm > 0
-    model = reconstruct(acquisition.uv[hit], acquisition.depth_mm[hit], frame.shape)
+    model = acquisition.reconstruct()
     hole = frame.depth_mm == 0
     error = np.abs(model - frame.depth_mm.astype(np.float32))
     image = _hatched(_coloured(error / ERROR_LIMIT_MM, cv2.COLORMAP_INFERNO), hole)
@@ -237,22 +235,23 @@ def finished(panel: Panel, width: int) -> Image:
     head, foot = 34, 34
     out = np.full((head + height + foot, width, 3), PAPER, dtype=np.uint8)
     out[head : head + height] = picture
-    size = 19 if width >= 420 else 16
-    write_text(out, panel.caption, 0, 23, size, weight=600)
+    wide = width >= 420
+    small = 15 if wide else 13
+    write_text(out, panel.caption, 0, 23, 19 if wide else 16, weight=600)
     base = head + height + 23
     left = 0
     if panel.colormap is not None:
-        left = write_text(out, panel.limits[0], 0, base, 15, colour=PALE) + 8
-        ramp = np.linspace(0, 255, 110).astype(np.uint8)[None, :].repeat(10, axis=0)
-        out[base - 10 : base, left : left + 110] = cv2.applyColorMap(ramp, panel.colormap)
-        left = write_text(out, panel.limits[1], left + 118, base, 15, colour=PALE) + 20
+        length = min(110, width // 5)
+        left = write_text(out, panel.limits[0], 0, base, small, colour=PALE) + 7
+        ramp = np.linspace(0, 255, length).astype(np.uint8)[None, :].repeat(10, axis=0)
+        out[base - 10 : base, left : left + length] = cv2.applyColorMap(ramp, panel.colormap)
+        left = write_text(out, panel.limits[1], left + length + 7, base, small, colour=PALE) + 8
     if panel.note:
-        note_left = width - text_width(panel.note, 15) - 2
-        if panel.name == "depth":
-            bar = width // 4
-            cv2.line(out, (width - bar, base + 7), (width - 1, base + 7), INK, 2)
-        if note_left > left:
-            write_text(out, panel.note, note_left, base, 15, colour=PALE)
+        right = width - text_width(panel.note, small) - 2
+        if right > left:
+            write_text(out, panel.note, right, base, small, colour=PALE)
+            if panel.name == "depth":
+                cv2.line(out, (width - width // 4, base + 7), (width - 1, base + 7), INK, 2)
     return out
 
 
