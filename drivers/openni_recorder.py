@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -18,6 +19,7 @@ _OPEN_S = 10.0  # a sensor that loads its firmware takes seconds
 _STALL_S = 5.0  # silence of the sensor after which a recording is ended
 _HANG_S = 5.0  # silence of the worker, which reports five times a second
 _SAVE_S = 10.0  # for the recorder to write what it still holds
+_RESERVE_BYTES = 16 << 20  # a recording ends while there is still room for the end of its file
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +104,7 @@ def record(
             frames=frames,
             duration_s=duration_s,
             stall_s=_STALL_S,
+            reserve_bytes=_RESERVE_BYTES,
         )
         try:
             _wait_for_stream(worker)
@@ -125,6 +128,12 @@ def _create(path: Path, unborn: Path, overwrite: bool) -> int:
     if not overwrite and path.exists() and path.stat().st_size > 0:
         raise SourceNotFoundError(f"'{path}' exists already. Give another name, or --overwrite.")
     try:
+        free_bytes = shutil.disk_usage(path.parent).free
+        if free_bytes < 2 * _RESERVE_BYTES:
+            raise SourceNotFoundError(
+                f"'{path}' cannot be recorded: {free_bytes >> 20} MB are free there, and a minute"
+                " takes about 200 MB. Give another place."
+            )
         return os.open(unborn, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
     except OSError as error:
         raise SourceNotFoundError(
@@ -176,6 +185,8 @@ def _verify(path: Path, seen: int) -> tuple[int, str]:
     """Count the frames of a finished recording, and have OpenNI2 itself open it again."""
     report = inspect_oni(path)
     frames = report.readable_frames
+    if frames == 0:
+        return 0, f"'{path}' holds no frame."
     if not report.complete:
         what = f" ({report.problems[0].sentence.rstrip('.')})" if report.problems else ""
         return frames, (

@@ -29,7 +29,6 @@ SILENT_FILE_S = 5.0  # a file in lock-step delivers within milliseconds; beyond 
 SETTLE_S = 0.05  # between stop and close: the runtime's threads set their flags late
 RECORDER_START_S = 5.0  # for the recorder's own thread to write the file's beginning
 DATA_BEGIN = b"NIR\0\x08\0\0\0"  # the record after which it takes frames
-DISK_RESERVE_BYTES = 16 << 20  # stop recording while there is still room for the file's end
 NO_GROWTH_S = 1.5  # a frame takes some 100 kB: a file that stops growing is not being written
 
 
@@ -498,7 +497,7 @@ class Recording:
         written = os.fstat(self._job["file"]).st_blocks * 512
         if written > self._written:
             self._written, self._grown_at = written, now
-        if room.f_bavail * room.f_frsize < DISK_RESERVE_BYTES:
+        if room.f_bavail * room.f_frsize < self._job["reserve_bytes"]:
             return "the disk is full"
         if self._last_frame - self._grown_at > NO_GROWTH_S:
             return "the file does not grow any more"
