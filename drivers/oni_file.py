@@ -7,8 +7,11 @@ player would rely on, before it gets to see the file.
 
 from __future__ import annotations
 
+import errno
+import os
 import stat
 import struct
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -39,7 +42,7 @@ from selective_depth.drivers.oni_records import (
     parse_property,
     read_record,
 )
-from selective_depth.drivers.source import SourceNotFoundError
+from selective_depth.drivers.source import DamagedRecordingError, SourceNotFoundError
 
 _STREAMS: Final = frozenset((NodeType.DEPTH, NodeType.IMAGE, NodeType.IR))
 CODECS: Final = frozenset((*DEPTH_CODECS, b"JPEG", b"Im8z"))
@@ -145,8 +148,8 @@ class OniReport:
         Bytes after the end, which OpenNI2's recorder leaves as zeros.
     old : bool
         True for versions before 1.0.1.0.
-    decoded : bool
-        True if every depth frame was decoded and not only its header read.
+    decoded_frames : int
+        Number of depth frames that were also decoded, not only found.
     """
 
     path: Path
@@ -160,7 +163,7 @@ class OniReport:
     ended: bool
     tail_bytes: int
     old: bool
-    decoded: bool
+    decoded_frames: int
 
     @property
     def readable_frames(self) -> int:
@@ -197,7 +200,8 @@ def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10
         Also decode every depth frame (about 1 ms each at 640x480), which finds most of the damage
         inside of frames. The format has no checksums: some of it cannot be found.
     timeout_s : float, default 10
-        Stop checking after so many seconds, and say so in the report.
+        Stop after so many seconds. Frames not decoded by then are not, see `decoded_frames`; a
+        file not walked through by then has a problem more, saying so.
 
     Raises
     ------
@@ -245,13 +249,13 @@ class _Inspection:
             self._walk()
             self._check_counts()
         depth = next((n for n in self.nodes.values() if n.node_type == NodeType.DEPTH), None)
-        camera, fps = None, 30.0
+        camera, fps, decoded = None, 30.0, 0
         if depth is not None:
             camera, fps = self._check_depth(depth)
             if camera is None:
                 depth.frames.clear()
             elif decode:
-                self._decode_frames(depth, camera)
+                decoded = self._decode_frames(depth, camera)
         elif self.version:
             self._problem(0, "the file holds no depth stream")
         return OniReport(
@@ -266,7 +270,7 @@ class _Inspection:
             ended=self.end is not None,
             tail_bytes=0 if self.end is None else self.size - self.end,
             old=self.old,
-            decoded=decode,
+            decoded_frames=decoded,
         )
 
     def _problem(self, offset: int, sentence: str, *, harmless: bool = False) -> None:
@@ -342,6 +346,7 @@ class _Inspection:
 
     def _find_magic(self, offset: int) -> Iterator[int]:
         while offset < self.size and not self._out_of_time(offset):
+            offset = _skip_hole(self.file, offset)
             self.file.seek(offset)
             block = self.file.read(_SCAN_BYTES)
             at = block.find(MAGIC)
@@ -527,23 +532,48 @@ class _Inspection:
                 self._problem(node.offset, f"{error}")
         return Camera.kinect(width, height)
 
-    def _decode_frames(self, node: OniNode, camera: Camera) -> None:
-        sound = []
+    def _decode_frames(self, node: OniNode, camera: Camera) -> int:
+        """Drop the frames that cannot be decoded; return how many can, as far as time allows."""
+        decoded, sound = 0, []
         for frame in node.frames:
-            if self._out_of_time(frame.record_offset):
-                break
-            payload = read_payload(self.file, frame)
-            if decode_depth(node.codec, payload, camera.height, camera.width) is None:
-                self._problem(frame.record_offset, f"frame {frame.number} cannot be decoded")
-            else:
-                sound.append(frame)
+            if time.monotonic() < self.deadline:
+                payload = read_payload(self.file, frame)
+                if decode_depth(node.codec, payload, camera.height, camera.width) is None:
+                    self._problem(frame.record_offset, f"frame {frame.number} cannot be decoded")
+                    continue
+                decoded += 1
+            sound.append(frame)
         node.frames[:] = sound
+        return decoded
+
+
+def _skip_hole(file: BinaryIO, offset: int) -> int:
+    """First byte at or after an offset that is really on the disk."""
+    if sys.platform != "linux":
+        return offset
+    try:
+        return os.lseek(file.fileno(), offset, os.SEEK_DATA)
+    except OSError as error:
+        # Nothing but a hole up to the end; or a file system that does not know.
+        return file.seek(0, os.SEEK_END) if error.errno == errno.ENXIO else offset
 
 
 def read_payload(file: BinaryIO, frame: OniFrame) -> bytes:
-    """Compressed data of a frame."""
-    file.seek(frame.payload_offset)
-    return file.read(frame.payload_size)
+    """Compressed data of a frame.
+
+    Raises
+    ------
+    DamagedRecordingError
+        If the disk does not give it.
+    """
+    try:
+        file.seek(frame.payload_offset)
+        return file.read(frame.payload_size)
+    except OSError as error:
+        raise DamagedRecordingError(
+            f"'{file.name}' cannot be read at byte {frame.payload_offset} ({error.strerror});"
+            " is its disk in order?"
+        ) from error
 
 
 def _set_property(node: OniNode, record: Record) -> None:

@@ -481,14 +481,29 @@ def test_what_is_no_recording_gets_a_report_and_no_frames(tmp_path: Path, conten
     assert not (tmp_path / "out.oni").exists()
 
 
-def test_checking_a_huge_file_ends_in_time(tmp_path: Path, recording: Path) -> None:
+def test_checking_a_huge_hole_ends_in_time(tmp_path: Path, recording: Path) -> None:
     path = tmp_path / "huge.oni"
     with path.open("wb") as file:
         data = recording.read_bytes()
         file.write(data[: data.rindex(MAGIC)])
-        file.truncate(1 << 36)  # all of it a hole
+        file.truncate(1 << 36)
     start = time.monotonic()
-    report = inspect_oni(path, timeout_s=0.3)
+    assert inspect_oni(path, decode=True, timeout_s=2).readable_frames == COUNT
     assert time.monotonic() - start < 5
-    assert report.readable_frames == COUNT
+
+
+def test_checking_stops_in_time_and_says_so(recording: Path) -> None:
+    report = inspect_oni(recording, decode=True, timeout_s=0)
     assert "took too long" in " ".join(map(str, report.problems))
+    assert (report.decoded_frames, report.openable) == (0, False)
+    assert inspect_oni(recording, decode=True).decoded_frames == COUNT
+    assert inspect_oni(recording).decoded_frames == 0
+
+
+def test_a_failing_disk_is_named(recording: Path) -> None:
+    with OniReader(recording) as reader:
+        assert reader._file is not None
+        os.close(reader._file.fileno())
+        with pytest.raises(DamagedRecordingError, match=r"cannot be read at byte .*Bad file"):
+            reader.read()
+        reader._file = None
