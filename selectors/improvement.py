@@ -13,13 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.selectors.improvement_kernel import improvement_rows
+from selective_depth.selectors.improvement_kernel import best_threshold, improvement_rows
 from selective_depth.selectors.improvement_scattered import EXPONENT
-from selective_depth.selectors.kriging import window_scratch
+from selective_depth.selectors.kriging import sample_buffers, window_scratch
+from selective_depth.selectors.lattice_kernel import LANES, lattice_scratch
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.selection import Selection
-from selective_depth.selectors.windows import windows_of
+from selective_depth.selectors.windows import Windows, windows_of
 
 HALF_SCORE = 2e-4
 """Improvement, as a share of the mean depth of the seeds, that scores one half."""
@@ -49,24 +50,6 @@ class ImprovementSelection(Selection):
     variance_mm2: FloatMap
     known: BoolMap
     raw: FloatMap
-
-
-def best_share(raw: FloatMap, known: BoolMap, share: float) -> BoolMap:
-    """Mark the best `share` of the known pixels.
-
-    Pixels of equal worth are taken together or not at all, so the result does not depend on
-    the order of pixels; pixels of no worth never are.
-    """
-    wanted = int(share * np.count_nonzero(known))
-    values = raw[known]
-    if wanted == 0:
-        return np.zeros(raw.shape, np.bool_)
-    place = len(values) - wanted
-    threshold = np.partition(values, place)[place]
-    mask: BoolMap = known & (raw >= threshold) & (raw > 0)
-    if np.count_nonzero(mask) > wanted:
-        mask = mask & (raw > threshold)
-    return mask
 
 
 class ImprovementSelector:
@@ -105,35 +88,27 @@ class ImprovementSelector:
         """Map the improvement over the whole frame and select its best pixels."""
         windows = windows_of(seeds, self.exponent)
         shape = seeds.frame_shape
-        estimate = np.empty(shape, np.float32)
-        variance = np.empty(shape, np.float32)
-        raw = np.empty(shape, np.float32)
+        maps = tuple(np.empty(shape, np.float32) for _ in range(4))
+        estimate, variance, raw, score = maps
         known = np.empty(shape, np.bool_)
-        depth = np.ascontiguousarray(seeds.depth_mm, np.float32)
-        rows, columns = windows.rows, windows.columns
+        padded = np.pad(np.asarray(seeds.depth_mm, np.float32), 1)
+        valid = padded[padded > 0]
+        half = np.float32(HALF_SCORE * valid.mean() if len(valid) else 1.0)
+        histograms = []
 
         def band(first_row: int, end_row: int) -> None:
-            scratch = window_scratch(windows.most_pixels)
-            samples = np.zeros(9, np.int64), np.zeros(9, np.int64), np.zeros(9, np.float32)
-            tallest = int((rows.before + rows.after).max()) - 1
-            widest = int((columns.before + columns.after).max()) - 1
-            across = len(columns.centres)
-            strips = np.zeros((2, 3, tallest, widest, across), np.float32)
-            held = np.zeros((2, across), np.float32)
-            mixed = np.zeros((3, widest, across), np.float32)
+            histogram = np.zeros(1 << 15, np.int64)
+            histograms.append(histogram)
             improvement_rows(
-                first_row, end_row, depth, rows.centres, rows.before, rows.after,
-                columns.centres, columns.before, columns.after, rows.blend, columns.blend,
-                windows.power, windows.reach_px**2, samples, scratch, strips, held, mixed,
-                np.zeros(across, np.float32), (estimate, variance, raw, known),
+                first_row, end_row, padded, half, *windows.kernel_arguments, _scratch(windows),
+                histogram, (*maps, known),
             )  # fmt: skip
 
         in_bands(band, shape[0], self.threads)
-        valid = depth[depth > 0]
-        half = HALF_SCORE * float(valid.mean()) if len(valid) else 1.0
-        score = raw / (raw + np.float32(half))
+        wanted = int(self.share * np.count_nonzero(known))
+        threshold = best_threshold(raw.ravel(), sum(histograms), wanted)
         return ImprovementSelection(
-            mask=best_share(raw, known, self.share),
+            mask=raw >= threshold,
             score=score,
             name="improvement",
             estimate_mm=estimate,
@@ -141,3 +116,20 @@ class ImprovementSelector:
             known=known,
             raw=raw,
         )
+
+
+def _scratch(windows: Windows) -> tuple[object, ...]:
+    """Working memory of `improvement_rows` for one band."""
+    rows, columns = windows.rows, windows.columns
+    tallest = int((rows.before + rows.after).max()) - 1
+    widest = int((columns.before + columns.after).max()) - 1
+    batches = len(windows.order[0])
+    return (
+        sample_buffers(),
+        lattice_scratch(windows.most_pixels),
+        window_scratch(windows.most_pixels),
+        np.zeros((2, 3, tallest, widest, batches, LANES), np.float32),
+        np.zeros((2, batches, LANES), np.float32),
+        np.zeros((3, widest, batches * LANES), np.float32),
+        np.zeros(batches * LANES, np.float32),
+    )

@@ -6,156 +6,264 @@ import numpy as np
 from numba import njit
 
 from selective_depth.selectors.kriging import krige_window
+from selective_depth.selectors.lattice_kernel import LANES, krige_lanes
+from selective_depth.selectors.lattice_tables import SEEDS
 from selective_depth.selectors.semivariogram import fit_samples
 
 
 @njit(cache=True, nogil=True)
-def gather_samples(depth, rows, columns, i, j, u, v, z):  # type: ignore[no-untyped-def]
+def gather_seeds(padded, rows, columns, i, j, samples):  # type: ignore[no-untyped-def]
     """Collect the seeds of the window about lattice point (i, j), the centre first.
 
     Parameters
     ----------
-    depth : float32 array of shape (R, C)
-        Depth of the seeds, 0 = missing.
+    padded : float32 array of shape (R + 2, C + 2)
+        Depth of the seeds, 0 = missing, with a rim of zeros.
     rows, columns : int64 arrays
         Where the lattice rows and columns are in the frame.
     i, j : int
         The window's lattice point.
-    u, v, z : arrays
-        Filled with columns, rows and depths of the seeds that returned depth.
+    samples : tuple
+        `sample_buffers`, filled with the seeds that returned depth.
 
     Returns
     -------
     int
         How many there are, at most nine.
     """
+    u, v, z, row_of = samples
     count = 0
-    if depth[i, j] > 0:
-        u[0], v[0], z[0] = columns[j], rows[i], depth[i, j]
-        count = 1
-    for ni in range(max(i - 1, 0), min(i + 2, len(rows))):
-        for nj in range(max(j - 1, 0), min(j + 2, len(columns))):
-            if depth[ni, nj] > 0 and not (ni == i and nj == j):
-                u[count], v[count], z[count] = columns[nj], rows[ni], depth[ni, nj]
-                count += 1
+    for n in range(SEEDS):
+        k = (n + SEEDS // 2) % SEEDS  # the centre is number 4 of 9
+        depth = padded[i + k // 3, j + k % 3]
+        if depth > 0:
+            u[count], v[count] = columns[j + k % 3 - 1], rows[i + k // 3 - 1]
+            z[count], row_of[count] = depth, k
+            count += 1
     return count
 
 
 @njit(cache=True, nogil=True)
 def krige_row(  # type: ignore[no-untyped-def]
-    i,
-    depth,
-    rows,
-    up,
-    down,
-    columns,
-    left,
-    right,
-    power,
-    frame_shape,
-    samples,
-    scratch,
-    strip,
-    held,
-):
+    i, padded, row_axis, column_axis, order, tables, power, frame_shape, samples, lattice_scratch,
+    window_scratch, strip, held,
+):  # fmt: skip
     """Krige all windows of one lattice row.
 
     Parameters
     ----------
-    strip : float32 array of shape (3, rows of a window, columns of a window, C)
+    strip : float32 array of shape (3, rows of a window, columns of a window, batches, LANES)
         Filled with estimate, variance and improvement of each window's pixels.
-    held : float32 array of shape (C,)
+    held : float32 array of shape (batches, LANES)
         Filled with the number of samples that each window holds, 0 if it has no system.
     """
-    u, v, z = samples
-    height, width = frame_shape
+    rows, ups, downs, row_shapes = row_axis
+    columns, lefts, rights, column_shapes = column_axis
+    lanes_columns, shape_of, place = order
+    first_pixel, distances = tables[0], tables[2]
+    column_shape_count = len(first_pixel) // (row_shapes.max() + 1)
+    up, down = ups[i], downs[i]
+    height = up + down - 1
+    u, v, z, _ = samples
     for j in range(len(columns)):
-        held[j] = 0
-        count = gather_samples(depth, rows, columns, i, j, u, v, z)
-        window_height = up[i] + down[i] - 1
-        window_width = left[j] + right[j] - 1
-        # One sample alone says nothing of how depth varies around it.
-        if count < 2:
-            strip[:, :window_height, :window_width, j] = 0
+        count = 0
+        for k in range(SEEDS):
+            count += padded[i + k // 3, j + k % 3] > 0
+        held[place[j] // LANES, place[j] % LANES] = count if count > 1 else 0
+    for batch in range(len(shape_of)):
+        if held[batch].max() == SEEDS:
+            j = lanes_columns[batch, 0]
+            geometry = row_shapes[i] * column_shape_count + shape_of[batch]
+            krige_lanes(
+                padded, i, lanes_columns, batch, geometry, up, down, lefts[j], rights[j], tables,
+                lattice_scratch, strip,
+            )  # fmt: skip
+    for j in range(len(columns)):
+        batch, lane = place[j] // LANES, place[j] % LANES
+        count = held[batch, lane]
+        if count == SEEDS:
             continue
-        held[j] = count
-        a, b = fit_samples(u, v, z, count, power)
-        u0, v0 = columns[j] - left[j] + 1, rows[i] - up[i] + 1
+        width = lefts[j] + rights[j] - 1
+        # One sample alone says nothing of how depth varies around it.
+        if count == 0:
+            strip[:, :height, :width, batch, lane] = 0
+            continue
+        gathered = gather_seeds(padded, rows, columns, i, j, samples)
+        a, b = fit_samples(u, v, z, gathered, power)
+        first = first_pixel[row_shapes[i] * column_shape_count + column_shapes[j]]
         krige_window(
-            u, v, z, count, 0, a, b, power, u0, v0, window_width, window_height, height, width,
-            scratch,
+            samples, gathered, a, b, power, distances, first, columns[j] - lefts[j] + 1,
+            rows[i] - up + 1, width, height, frame_shape, window_scratch,
         )  # fmt: skip
-        for row in range(window_height):
-            for column in range(window_width):
-                p = (row + 1) * (window_width + 2) + column + 1
-                strip[0, row, column, j] = scratch[0][p]
-                strip[1, row, column, j] = scratch[1][p]
-                strip[2, row, column, j] = scratch[2][p]
+        for row in range(height):
+            for column in range(width):
+                p = (row + 1) * (width + 2) + column + 1
+                strip[0, row, column, batch, lane] = window_scratch[0][p]
+                strip[1, row, column, batch, lane] = window_scratch[1][p]
+                strip[2, row, column, batch, lane] = window_scratch[2][p]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def blend_down(share_one, one, held_one, share_other, other, held_other, mixed, held):  # type: ignore[no-untyped-def]
+    """Blend the same pixel row of two lattice rows' windows, weighted; place by place."""
+    for k in range(len(held)):
+        held[k] = share_one * held_one[k] + share_other * held_other[k]
+    for q in range(mixed.shape[0]):
+        for column in range(mixed.shape[1]):
+            into, here, there = mixed[q, column], one[q, column], other[q, column]
+            for k in range(len(held)):
+                into[k] = share_one * held_one[k] * here[k] + share_other * held_other[k] * there[k]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def blend_across(column_blend, places, mixed, held, estimate, variance, raw):  # type: ignore[no-untyped-def]
+    """Blend one pixel row across from the windows left and right of each pixel."""
+    _, _, _, _, first_weight, second_weight = column_blend
+    first_place, second_place, first_cell, second_cell = places
+    flat_estimate, flat_variance, flat_raw = mixed[0].ravel(), mixed[1].ravel(), mixed[2].ravel()
+    for x in range(len(estimate)):
+        j, k = first_cell[x], second_cell[x]
+        one, other = first_weight[x], second_weight[x]
+        scale = np.float32(1.0) / (one * held[first_place[x]] + other * held[second_place[x]])
+        one *= scale
+        other *= scale
+        estimate[x] = one * flat_estimate[j] + other * flat_estimate[k]
+        variance[x] = one * flat_variance[j] + other * flat_variance[k]
+        raw[x] = one * flat_raw[j] + other * flat_raw[k]
 
 
 @njit(cache=True, nogil=True)
-def near_sample(depth, rows, columns, i, j, y, x, reach_squared):  # type: ignore[no-untyped-def]
+def near_seed(padded, rows, columns, i, j, y, x, reach_squared):  # type: ignore[no-untyped-def]
     """Whether any of the 4x4 seeds around cell (i, j) returned depth near pixel (y, x)."""
     for ni in range(max(i - 1, 0), min(i + 3, len(rows))):
         dy = rows[ni] - y
         for nj in range(max(j - 1, 0), min(j + 3, len(columns))):
             dx = columns[nj] - x
-            if depth[ni, nj] > 0 and dx * dx + dy * dy <= reach_squared:
+            if padded[ni + 1, nj + 1] > 0 and dx * dx + dy * dy <= reach_squared:
                 return True
     return False
 
 
 @njit(cache=True, nogil=True)
-def blend_row(  # type: ignore[no-untyped-def]
-    y, i, depth, rows, columns, x_first, x_second, x_first_at, x_second_at, x_first_weight,
-    x_second_weight, reach_squared, mixed, held, out,
+def mark_unknown(  # type: ignore[no-untyped-def]
+    y, i, padded, rows, columns, column_blend, places, reach_squared, held, estimate, variance,
+    raw, known,
 ):  # fmt: skip
-    """Blend one pixel row across; `mixed` and `held` are its windows' values and weights."""
-    estimate, variance, raw, known = out
-    for x in range(len(x_first)):
-        j, k = x_first[x], x_second[x]
-        at_j, at_k = x_first_at[x], x_second_at[x]
-        share_j, share_k = x_first_weight[x], x_second_weight[x]
-        total = share_j * held[j] + share_k * held[k]
-        near = total > 0 and near_sample(depth, rows, columns, i, j, y, x, reach_squared)
-        known[y, x] = near
-        if near:
-            scale = np.float32(1.0) / total
-            estimate[y, x] = scale * (share_j * mixed[0, at_j, j] + share_k * mixed[0, at_k, k])
-            variance[y, x] = scale * (share_j * mixed[1, at_j, j] + share_k * mixed[1, at_k, k])
-            raw[y, x] = scale * (share_j * mixed[2, at_j, j] + share_k * mixed[2, at_k, k])
-        else:
-            estimate[y, x] = np.nan
-            variance[y, x] = np.nan
-            raw[y, x] = 0
+    """Tell known pixels of a row from those too far from every seed, and clear the latter.
+
+    `i` is the lattice row at or above pixel row `y`, -1 above the first.
+    """
+    _, _, _, _, first_weight, second_weight = column_blend
+    first_place, second_place = places[0], places[1]
+    for j in range(-1, len(columns)):
+        start = columns[j] if j >= 0 else 0
+        end = columns[j + 1] if j + 1 < len(columns) else len(known)
+        # The padded rim is missing, so cells at the edge are never taken as whole.
+        whole = padded[i + 1, j + 1] > 0 and padded[i + 1, j + 2] > 0
+        whole = whole and padded[i + 2, j + 1] > 0 and padded[i + 2, j + 2] > 0
+        for x in range(start, end):
+            near = whole
+            if not whole:
+                total = first_weight[x] * held[first_place[x]]
+                total += second_weight[x] * held[second_place[x]]
+                near = total > 0 and near_seed(padded, rows, columns, i, j, y, x, reach_squared)
+                if not near:
+                    estimate[x] = np.nan
+                    variance[x] = np.nan
+                    raw[x] = 0
+            known[x] = near
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def improvement_rows(  # type: ignore[no-untyped-def]
-    first_row, end_row, depth, rows, up, down, columns, left, right, row_blend, column_blend,
-    power, reach_squared, samples, scratch, strips, held, mixed, mixed_held, out,
+    first_row, end_row, padded, half, row_axis, column_axis, row_blend, column_blend, order,
+    places, tables, power, reach_squared, scratch, histogram, out,
 ):  # fmt: skip
-    """Map the pixel rows `first_row` to `end_row` - 1 of a frame."""
+    """Map the pixel rows `first_row` to `end_row` - 1 of a frame.
+
+    Parameters
+    ----------
+    half : float
+        The improvement that scores one half.
+    histogram : int64 array of shape (2^15,)
+        Number of known pixels by the upper half of the bits of their improvement.
+    out : tuple
+        Estimate, variance, improvement, score and known of the frame.
+    """
+    estimate, variance, raw, score, known = out
+    samples, lattice_scratch, window_scratch, strips, helds, mixed, held = scratch
+    frame_shape = estimate.shape
+    rows, columns = row_axis[0], column_axis[0]
     y_first, y_second, y_first_at, y_second_at, y_first_weight, y_second_weight = row_blend
-    x_first, x_second, x_first_at, x_second_at, x_first_weight, x_second_weight = column_blend
-    frame_shape = (len(y_first), len(x_first))
+    flat = strips.reshape((2, 3, strips.shape[2], strips.shape[3], -1))
+    flat_held = helds.reshape((2, -1))
     ready = -1
     for y in range(first_row, end_row):
         i, k = y_first[y], y_second[y]
         # Lattice row n is kept in slot n % 2 as long as it is needed.
         for n in range(max(ready + 1, i), k + 1):
             krige_row(
-                n, depth, rows, up, down, columns, left, right, power, frame_shape, samples,
-                scratch, strips[n % 2], held[n % 2],
+                n, padded, row_axis, column_axis, order, tables, power, frame_shape, samples,
+                lattice_scratch, window_scratch, strips[n % 2], helds[n % 2],
             )  # fmt: skip
             ready = n
-        share_i, share_k = y_first_weight[y], y_second_weight[y]
-        mixed_held[:] = share_i * held[i % 2] + share_k * held[k % 2]
-        for q in range(3):
-            mixed[q] = share_i * held[i % 2] * strips[i % 2, q, y_first_at[y]]
-            if share_k > 0:
-                mixed[q] += share_k * held[k % 2] * strips[k % 2, q, y_second_at[y]]
-        blend_row(
-            y, i, depth, rows, columns, x_first, x_second, x_first_at, x_second_at,
-            x_first_weight, x_second_weight, reach_squared, mixed, mixed_held, out,
+        blend_down(
+            y_first_weight[y], flat[i % 2, :, y_first_at[y]], flat_held[i % 2],
+            y_second_weight[y], flat[k % 2, :, y_second_at[y]], flat_held[k % 2], mixed, held,
         )  # fmt: skip
+        blend_across(column_blend, places, mixed, held, estimate[y], variance[y], raw[y])
+        above = i if rows[i] <= y else -1
+        mark_unknown(
+            y, above, padded, rows, columns, column_blend, places, reach_squared, held,
+            estimate[y], variance[y], raw[y], known[y],
+        )  # fmt: skip
+        for x in range(frame_shape[1]):
+            score[y, x] = raw[y, x] / (raw[y, x] + half)
+        bits = raw[y].view(np.int32)
+        for x in range(frame_shape[1]):
+            histogram[bits[x] >> 16] += 1
+
+
+@njit(cache=True, nogil=True)
+def best_threshold(raw, histogram, wanted):  # type: ignore[no-untyped-def]
+    """Least improvement of the `wanted` best pixels, exactly.
+
+    Pixels of equal worth are taken together or not at all, so that the choice does not depend
+    on the order of pixels; pixels of no worth never are.
+
+    Parameters
+    ----------
+    raw : float32 array of shape (n,)
+        Improvements, >= 0.
+    histogram : int64 array of shape (2^15,)
+        How many share the upper half of their bits: floats >= 0 are in the order of their bits.
+    wanted : int
+        How many pixels to take at most.
+
+    Returns
+    -------
+    float32
+        ``raw >= threshold`` selects them.
+    """
+    level = len(histogram) - 1
+    above = 0
+    while level > 0 and above + histogram[level] <= wanted:
+        above += histogram[level]
+        level -= 1
+    edge = np.empty(1, np.int32)
+    edge[0] = (level + 1) << 16
+    if level == 0 or above == wanted:
+        return edge.view(np.float32)[0]
+    bits = raw.view(np.int32)
+    group = np.empty(histogram[level], np.int32)
+    count = 0
+    for n in range(len(bits)):
+        if bits[n] >> 16 == level:
+            group[count] = bits[n]
+            count += 1
+    group.sort()
+    place = count - (wanted - above)
+    edge[0] = group[place]
+    if group[place - 1] == group[place]:
+        edge[0] += 1
+    return edge.view(np.float32)[0]

@@ -13,7 +13,12 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from selective_depth.selectors.kriging import MAX_SAMPLES, krige_window, window_scratch
+from selective_depth.selectors.kriging import (
+    MAX_SAMPLES,
+    krige_window,
+    sample_buffers,
+    window_scratch,
+)
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.semivariogram import fit_samples
 from selective_depth.selectors.windows import Windows, windows_over
@@ -116,6 +121,7 @@ def _map(
             first_row, end_row, measured, asked,
             rows.centres, rows.before, rows.after, columns.centres, columns.before, columns.after,
             windows.power, spiral, windows.reach_px**2,
+            sample_buffers(), np.zeros((MAX_SAMPLES, windows.most_pixels), np.float32),
             window_scratch(windows.most_pixels),
             np.zeros((3, end_row - first_row, measured.shape[1]), np.float32),
             np.zeros((end_row - first_row, measured.shape[1]), np.float32),
@@ -136,10 +142,11 @@ def _spiral(reach: int) -> npt.NDArray[np.int64]:
 
 @njit(cache=True, nogil=True)
 def _gather(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
-    measured, spiral, row, column, up, down, left, right, u, v, z
+    measured, spiral, row, column, up, down, left, right, samples
 ):
     """Collect the samples of a window's box, the nearest to its centre first."""
     height, width = measured.shape
+    u, v, z, row_of = samples
     count = 0
     in_box = (up + down + 1) * (left + right + 1)
     for n in range(len(spiral)):
@@ -149,7 +156,7 @@ def _gather(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
         in_box -= 1
         y, x = row + dv, column + du
         if 0 <= y < height and 0 <= x < width and measured[y, x] > 0:
-            u[count], v[count], z[count] = x, y, measured[y, x]
+            u[count], v[count], z[count], row_of[count] = x, y, measured[y, x], count
             count += 1
         if count == len(u) or in_box == 0:
             break
@@ -171,13 +178,12 @@ def _near_sample(measured, spiral, y, x, reach_squared):  # type: ignore[no-unty
 @njit(cache=True, nogil=True)
 def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
     first_row, end_row, measured, asked, rows, up, down, columns, left, right, power, spiral,
-    reach_squared, scratch, sums, held, out,
+    reach_squared, samples, distances, scratch, sums, held, out,
 ):  # fmt: skip
     estimate, variance, raw, known = out
-    frame_height, frame_width = measured.shape
-    u = np.zeros(MAX_SAMPLES, np.int64)
-    v = np.zeros(MAX_SAMPLES, np.int64)
-    z = np.zeros(MAX_SAMPLES, np.float32)
+    u, v, z, _ = samples
+    reach = power.shape[0] // 2
+    frame_width = measured.shape[1]
     for i in range(len(rows)):
         top, bottom = rows[i] - up[i] + 1, rows[i] + down[i]
         y0, y1 = max(top, first_row), min(bottom, end_row)
@@ -189,15 +195,23 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
             if not asked[y0:y1, x0:x1].any():
                 continue
             count = _gather(
-                measured, spiral, rows[i], columns[j], up[i], down[i], left[j], right[j], u, v, z
+                measured, spiral, rows[i], columns[j], up[i], down[i], left[j], right[j], samples
             )
             # One sample alone says nothing of how depth varies around it.
             if count < 2:
                 continue
             a, b = fit_samples(u, v, z, count, power)
+            width, height = end - start, bottom - top
+            for n in range(count):
+                p = 0
+                for y in range(top - 1, bottom + 1):
+                    line = power[reach + y - v[n]]
+                    for x in range(start - 1, end + 1):
+                        distances[n, p] = line[reach + x - u[n]]
+                        p += 1
             krige_window(
-                u, v, z, count, 0, a, b, power, start, top, end - start, bottom - top,
-                frame_height, frame_width, scratch,
+                samples, count, a, b, power, distances, 0, start, top, width, height,
+                measured.shape, scratch,
             )  # fmt: skip
             for y in range(y0, y1):
                 gap = up[i] if y < rows[i] else down[i]

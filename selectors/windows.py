@@ -11,11 +11,13 @@ A window's weight has faded to nothing where it ends, so nothing jumps.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.selectors.lattice_kernel import LANES
+from selective_depth.selectors.lattice_tables import LatticeTables, build_tables
 from selective_depth.selectors.seeds import SeedGrid, cell_centres
 from selective_depth.selectors.semivariogram import power_table
 
@@ -61,6 +63,13 @@ class Axis:
     second_at: IntArray
     first_weight: npt.NDArray[np.float32]
     second_weight: npt.NDArray[np.float32]
+
+    @cached_property
+    def shapes(self) -> tuple[IntArray, IntArray]:
+        """The different (before, after), shape (k, 2), and which of them each window has."""
+        pairs = np.stack((self.before, self.after), axis=1)
+        different, which = np.unique(pairs, axis=0, return_inverse=True)
+        return different, which.ravel().astype(np.int64)
 
     @property
     def blend(self) -> tuple[npt.NDArray[np.generic], ...]:
@@ -114,12 +123,74 @@ class Windows:
         Greatest distance in pixels from a sample to a known pixel.
     power : float64 array
         `power_table` that reaches across a window and its rim.
+    exponent : float
+        The w of eq. (24).
     """
 
     rows: Axis
     columns: Axis
     reach_px: float
     power: npt.NDArray[np.float64]
+    exponent: float
+
+    @cached_property
+    def tables(self) -> LatticeTables:
+        """Tables of every geometry: row shape by row shape, column shapes within."""
+        return build_tables(
+            [
+                (int(up), int(down), int(left), int(right))
+                for up, down in self.rows.shapes[0]
+                for left, right in self.columns.shapes[0]
+            ],
+            self.exponent,
+        )
+
+    @cached_property
+    def order(self) -> tuple[IntArray, IntArray, IntArray]:
+        """How the windows of a lattice row are laid side by side.
+
+        Returns
+        -------
+        columns : int64 array of shape (batches, LANES)
+            Lattice column in each lane; all windows of a batch have one shape, and the last
+            column of a shape fills its batch up.
+        shape_of : int64 array of shape (batches,)
+            Which of the column shapes a batch has.
+        place : int64 array of shape (C,)
+            Where each lattice column went: batch * LANES + lane.
+        """
+        which = self.columns.shapes[1]
+        batches, shape_of = [], []
+        place = np.zeros(len(which), np.int64)
+        for shape in range(len(self.columns.shapes[0])):
+            members = np.flatnonzero(which == shape)
+            place[members] = len(batches) * LANES + np.arange(len(members))
+            for first in range(0, len(members), LANES):
+                batch = members[first : first + LANES]
+                batches.append(np.pad(batch, (0, LANES - len(batch)), mode="edge"))
+                shape_of.append(shape)
+        return np.array(batches, np.int64), np.array(shape_of, np.int64), place
+
+    @cached_property
+    def kernel_arguments(self) -> tuple[object, ...]:
+        """Everything about the lattice that `improvement_kernel.improvement_rows` takes."""
+        rows, columns = self.rows, self.columns
+        lanes_columns, shape_of, place = self.order
+        places = lanes_columns.size
+        # Where each pixel's value is in a row of blended windows, flattened.
+        first, second = place[columns.first], place[columns.second]
+        cells = first + places * columns.first_at, second + places * columns.second_at
+        return (
+            (rows.centres, rows.before, rows.after, rows.shapes[1]),
+            (columns.centres, columns.before, columns.after, columns.shapes[1]),
+            rows.blend,
+            columns.blend,
+            (lanes_columns, shape_of, place),
+            (first, second, *cells),
+            self.tables.arrays(),
+            self.power,
+            self.reach_px**2,
+        )
 
     @property
     def most_pixels(self) -> int:
@@ -144,7 +215,7 @@ def _windows(frame_shape: tuple[int, int], rows: bytes, columns: bytes, exponent
     widest = max(
         int(a.max()) for axis in (row_axis, column_axis) for a in (axis.before, axis.after)
     )
-    return Windows(row_axis, column_axis, reach_px, power_table(exponent, 2 * widest + 2))
+    return Windows(row_axis, column_axis, reach_px, power_table(exponent, 2 * widest + 2), exponent)
 
 
 def windows_of(seeds: SeedGrid, exponent: float) -> Windows:
