@@ -136,11 +136,11 @@ def test_a_full_disk_is_refused_at_once_and_noticed_on_the_way(
     virtual_sensor: VirtualSensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     free_bytes = shutil.disk_usage(tmp_path).free
-    monkeypatch.setattr("selective_depth.drivers.openni_recorder._RESERVE_BYTES", free_bytes)
+    monkeypatch.setattr("selective_depth.drivers.openni_recorder._RESERVE_BYTES", 2 * free_bytes)
     with pytest.raises(SourceNotFoundError, match="MB are free"):
         record(tmp_path / "out.oni")
     assert not list(tmp_path.glob("out*"))
-    plenty = shutil.disk_usage(tmp_path)._replace(free=3 * free_bytes)
+    plenty = shutil.disk_usage(tmp_path)._replace(free=9 * free_bytes)
     monkeypatch.setattr("shutil.disk_usage", lambda _: plenty)
     report = record(tmp_path / "out.oni")
     assert (report.ended, report.frames) == ("the disk is full", 0)
