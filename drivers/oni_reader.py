@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
+
+import numpy as np
 
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni_codec import decode_depth
@@ -108,7 +111,8 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
     """Write what is readable of an .oni file to a new one that OpenNI2 replays.
 
     Every stream is kept, compressed as it was; frames that are damaged are left out and the rest
-    numbered anew. An .oni file whose recorder was killed comes back whole.
+    numbered anew; times that run backwards are interpolated. A file whose recorder was killed
+    comes back whole.
 
     Parameters
     ----------
@@ -137,7 +141,7 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
     with _open(report.path) as file:
         writer = RecordWriter(Path(out_path))
         try:
-            frames: list[tuple[int, OniFrame]] = []
+            frames: list[tuple[int, OniFrame, int]] = []
             for node in report.nodes:
                 if node.is_stream and not (node.ready and node.codec in CODECS):
                     continue
@@ -145,10 +149,11 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
                 properties = {**known, **node.properties}
                 addition = NodeAddition(node.name, node.node_type, node.codec, None, 0)
                 writer.add_node(node.number, addition, properties)
-                frames += [(node.number, frame) for frame in node.frames]
+                times_us = _mended_times(node.frames)
+                frames += [(node.number, *item) for item in zip(node.frames, times_us, strict=True)]
             writer.begin()
-            for number, frame in sorted(frames, key=lambda item: item[1].record_offset):
-                writer.add_frame(number, frame.timestamp_us, read_payload(file, frame))
+            for number, frame, time_us in sorted(frames, key=lambda item: item[1].record_offset):
+                writer.add_frame(number, time_us, read_payload(file, frame))
         finally:
             writer.close()
     return inspect_oni(out_path, decode=True, timeout_s=float("inf"))
@@ -186,13 +191,14 @@ def export_oni(
     depth, camera = report.depth, report.camera
     assert depth is not None and camera is not None
     with _open(report.path) as file, FolderWriter(folder, fps=report.fps) as out:
-        for index, frame in enumerate(depth.frames):
+        times_us = _mended_times(depth.frames)
+        for index, (frame, time_us) in enumerate(zip(depth.frames, times_us, strict=True)):
             depth_mm = decode_depth(
                 depth.codec, read_payload(file, frame), camera.height, camera.width
             )
             if depth_mm is None:
                 raise DamagedRecordingError(f"'{path}' has changed while it was read.")
-            out.write(DepthFrame(depth_mm, index, frame.timestamp_us, camera, str(path)))
+            out.write(DepthFrame(depth_mm, index, time_us, camera, str(path)))
             if progress is not None:
                 progress(index + 1)
     return report
@@ -205,6 +211,33 @@ def _trusted_frames(report: OniReport) -> tuple[list[OniFrame], str | None]:
     if damage is None:
         return frames, None
     return [frame for frame in frames if frame.record_offset < damage.offset], str(damage)
+
+
+def _mended_times(frames: list[OniFrame]) -> list[int]:
+    """Timestamps that never run backwards: the few that break the order are interpolated.
+
+    Kept is the longest increasing sequence among them, so that one wild value does not count as
+    many old ones.
+    """
+    ends: list[int] = []  # smallest last value of an increasing sequence of each length
+    at: list[int] = []  # and where it stands
+    before: list[int] = []
+    for index, frame in enumerate(frames):
+        length = bisect_right(ends, frame.timestamp_us)
+        before.append(at[length - 1] if length else -1)
+        ends[length:] = [frame.timestamp_us, *ends[length + 1 :]]
+        at[length:] = [index, *at[length + 1 :]]
+    kept = []
+    index = at[-1] if at else -1
+    while index >= 0:
+        kept.append(index)
+        index = before[index]
+    kept.reverse()
+    if len(kept) == len(frames):
+        return [frame.timestamp_us for frame in frames]
+    first_us = frames[kept[0]].timestamp_us  # floating point is exact for what is left
+    since_us = [frames[index].timestamp_us - first_us for index in kept]
+    return [first_us + round(us) for us in np.interp(range(len(frames)), kept, since_us)]
 
 
 def _rescuable(path: str | Path) -> OniReport:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from conftest import OniSample
+from oni_mutations import cuts, mutations
 from raw_oni_player import digest_of, play_all
 
 from selective_depth.drivers.frame import Camera, DepthFrame
@@ -293,6 +294,31 @@ def test_a_frame_that_cannot_be_decoded_ends_the_replay_with_its_place(recording
                 reader.read()
 
 
+@pytest.mark.parametrize(
+    ("times_us", "mended_us"),
+    [
+        ([0, 10, 20, 30], [0, 10, 20, 30]),
+        ([0, 10, 2**62, 30], [0, 10, 20, 30]),
+        ([0, 10, 20, 1, 40], [0, 10, 20, 30, 40]),
+        ([7, 7, 7, 7], [7, 7, 7, 7]),
+        ([2**62, 10, 20, 30], [10, 10, 20, 30]),
+        ([2**60, 2**60 + 1, 5, 2**60 + 3], [2**60, 2**60 + 1, 2**60 + 2, 2**60 + 3]),
+    ],
+)
+def test_repair_interpolates_times_that_break_the_order(
+    tmp_path: Path, times_us: list[int], mended_us: list[int]
+) -> None:
+    writer = RecordWriter(tmp_path / "odd.oni")
+    depth = NodeAddition("Depth", NodeType.DEPTH, CODEC_TABLE, None, 0)
+    writer.add_node(1, depth, depth_properties(CAMERA, 30))
+    writer.begin()
+    for time_us in times_us:
+        writer.add_frame(1, time_us, encode_depth(_frames(1)[0].depth_mm))
+    writer.close()
+    assert repair_oni(tmp_path / "odd.oni", tmp_path / "out.oni").complete
+    assert [frame.timestamp_us for frame in _read(tmp_path / "out.oni")] == mended_us
+
+
 def test_timestamps_are_held_against_the_seek_table(recording: Path) -> None:
     data = bytearray(recording.read_bytes())
     frame = inspect_oni(recording).depth.frames[3]  # type: ignore[union-attr]
@@ -444,6 +470,37 @@ def test_files_of_openni_1_are_read_and_brought_up_to_date(tmp_path: Path) -> No
     _assert_same(_read(path), _frames())
     assert not repair_oni(path, tmp_path / "new.oni").old
     _assert_same(_read(tmp_path / "new.oni"), _frames())
+
+
+def test_hundreds_of_damaged_files_give_frames_or_named_errors_and_can_be_repaired(
+    recording: Path, tmp_path: Path
+) -> None:
+    sound = recording.read_bytes()
+    path, out = tmp_path / "damaged.oni", tmp_path / "out.oni"
+    saved = 0
+    for name, data in [*cuts(sound, 50), *mutations(sound, 350, seed=1)]:
+        path.write_bytes(data)
+        report = inspect_oni(path, decode=True)
+        try:
+            frames = _read(path)
+        except DamagedRecordingError:
+            frames = []
+        if report.complete:
+            assert len(frames) == report.readable_frames, name
+        if report.readable_frames == 0:
+            assert not frames, name
+            with pytest.raises(DamagedRecordingError, match="nothing can be saved"):
+                repair_oni(path, out)
+            continue
+        assert len(frames) <= report.readable_frames, name
+        repaired = repair_oni(path, out)
+        assert repaired.complete and repaired.readable_frames == report.readable_frames, name
+        again = _read(out)
+        for frame, same in zip(frames, again, strict=False):
+            np.testing.assert_array_equal(frame.depth_mm, same.depth_mm, name)
+        out.unlink()
+        saved += len(again)
+    assert saved > 1200
 
 
 # What is no recording at all
