@@ -13,13 +13,13 @@ from pathlib import Path
 
 from selective_depth.app.errors import UsageError
 from selective_depth.app.loop import Loop
+from selective_depth.app.places import Viewer, has_display
 from selective_depth.app.progress import FrameProgress, waiting
 from selective_depth.app.realtime import RealtimeSource
 from selective_depth.app.report import RunReport, count_samples, print_report, save_settings, say
 from selective_depth.app.settings import Settings, ViewerOptions
 from selective_depth.app.step import StateNote, Step
 from selective_depth.app.stills import StillRow, contact_sheet, save_png
-from selective_depth.app.viewer import Viewer, has_display
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.source import (
     DamagedRecordingError,

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import os
-import shutil
 import socket
-import sys
 import time
 from pathlib import Path
-from urllib.parse import urlsplit
+from typing import Self
 
 import cv2
 import numpy as np
@@ -20,26 +17,11 @@ import rerun.blueprint as rrb
 
 from selective_depth.app import legend
 from selective_depth.app.errors import ViewerError
-from selective_depth.app.handover import Handover
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.step import StateNote, Step
-from selective_depth.app.timing import STAGES, StageTimes
-from selective_depth.drivers.source import OutputError
+from selective_depth.app.timing import STAGES
 
 APPLICATION = "selective-depth"
-VIEWER_PORT = 9876
-PROBE_S = 0.3
-"""How long an address is tried. Where no viewer listens the SDK itself would block for 5 s
-and lose what is logged."""
-CHECK_EVERY_S = 1.0
-SPARE_BYTES = 64 << 20
-"""Saving ends, with a whole file, when the disk has less room than this."""
-STALL_S = 0.5
-"""A viewer that takes longer over a step has stalled; a recording waits no more."""
-FILE_QUEUE = 8
-EXIT_S = 1.0
-"""How long a sink may take over its last frames."""
-
 DEPTH_COLOURS = legend.palette(cv2.COLORMAP_VIRIDIS)
 CENTRE = np.float32(0.5)
 """Rerun puts pixel centres at halves, we at whole numbers."""
@@ -313,195 +295,82 @@ def blueprint(*, acquiring: bool, detail: bool, look_at_m: float = 2.0) -> rrb.B
 # Where it goes
 
 
-class _Stream:
-    """A recording stream of its own: what befalls one sink must not touch another."""
+class Recording:
+    """A recording stream with one sink; whoever made it is the only thread to use it.
 
-    def __init__(self, options: ViewerOptions, times: StageTimes) -> None:
-        self.options = options
-        self._times = times
-        self._stream: rr.RecordingStream | None = None
-        self._logger: StepLogger | None = None
+    Each sink has a stream of its own: what befalls one must not touch another.
 
-    def open(self) -> None:
-        """Open the sink in the thread that will feed it."""
-        self._begin(self._target())
+    Parameters
+    ----------
+    target : rr.FileSink, rr.GrpcSink or rr.GrpcServerSink
+        Where it goes; use `to_file`, `to_viewer` or `to_server`.
+    options : ViewerOptions
+        What the user asked to see.
+    """
 
-    def put(self, item: Step | StateNote) -> None:
-        """Log a step, or the sensor's state."""
-        assert self._logger is not None
-        if isinstance(item, StateNote):
-            self._logger.log_state(item.state)
-            return
-        with self._times.stage("log"):
-            self._logger.log(item)
-
-    def close(self) -> None:
-        """Send what is left and let go."""
-        if self._stream is not None:
-            self._stream.flush(timeout_sec=EXIT_S)
-            self._stream.disconnect()
-
-    def _target(self) -> rr.FileSink | rr.GrpcSink | rr.GrpcServerSink:
-        raise NotImplementedError
-
-    def _begin(self, target: rr.FileSink | rr.GrpcSink | rr.GrpcServerSink) -> None:
+    def __init__(
+        self, target: rr.FileSink | rr.GrpcSink | rr.GrpcServerSink, options: ViewerOptions
+    ) -> None:
         self._stream = rr.RecordingStream(APPLICATION)
         self._stream.set_sinks(target)
-        self._logger = StepLogger(self._stream, self.options)
+        self._logger = StepLogger(self._stream, options)
 
+    @classmethod
+    def to_file(cls, path: Path, options: ViewerOptions) -> Self:
+        """Write an .rrd."""
+        return cls(rr.FileSink(str(path)), options)
 
-class FileStream(_Stream):
-    """Saves to an .rrd, and keeps it readable whatever happens to the disk.
+    @classmethod
+    def to_viewer(cls, url: str, options: ViewerOptions) -> Self:
+        """Send to a viewer that listens; where none does, this blocks for 5 s."""
+        return cls(rr.GrpcSink(url), options)
 
-    The SDK's writer says nothing when a write fails and never ends after it. So room is
-    checked before every step, and once a second what was written is made sure of: after a
-    failure the file is cut back to there.
-    """
+    @classmethod
+    def to_server(cls, host: str, port: int, options: ViewerOptions) -> Self:
+        """Serve viewers that join."""
+        sink = rr.GrpcServerSink(host, port, server_memory_limit=options.serve_memory)
+        return cls(sink, options)
 
-    def __init__(self, path: Path, options: ViewerOptions, times: StageTimes) -> None:
-        super().__init__(options, times)
-        self.path = path
-        self._sure_bytes = 0
-        self._checked_s = time.monotonic()
+    def log(self, item: Step | StateNote) -> None:
+        """Log a step, or the sensor's state."""
+        if isinstance(item, StateNote):
+            self._logger.log_state(item.state)
+        else:
+            self._logger.log(item)
+
+    def flush(self, timeout_s: float = 1e9) -> bool:
+        """Wait until everything is sent or written; False if it is not, in time or for good."""
         try:
-            with path.open("wb"):
-                pass
-        except OSError as error:
-            raise OutputError(
-                f"cannot write '{path}': {error.strerror}. Name a file in a folder that exists and"
-                " is yours to write."
-            ) from None
-
-    def _target(self) -> rr.FileSink:
-        return rr.FileSink(str(self.path))
-
-    def put(self, item: Step | StateNote) -> None:
-        """Log a step, if the disk has room for it."""
-        free = shutil.disk_usage(self.path.parent).free
-        if free < SPARE_BYTES:
-            self.close()
-            raise OutputError(
-                f"the disk is full ({free >> 20} MiB free). '{self.path}' was ended and is whole as"
-                " far as it goes; make room and run it again."
-            )
-        super().put(item)
-        if time.monotonic() - self._checked_s > CHECK_EVERY_S:
-            self._make_sure()
-
-    def close(self) -> None:
-        """Write the rest and the index."""
-        if self._stream is not None:
-            self._make_sure()
-            self._stream.disconnect()
-
-    def _make_sure(self) -> None:
-        assert self._stream is not None
-        try:
-            self._stream.flush(timeout_sec=EXIT_S)
-        except RuntimeError as error:
-            _ABANDONED.append(self._stream)
-            os.truncate(self.path, self._sure_bytes)
-            raise OutputError(
-                f"writing '{self.path}' failed after {self._sure_bytes:,} bytes, which are kept"
-                f" ({error}). Check the disk and its quota, and run it again."
-            ) from None
-        self._sure_bytes = self.path.stat().st_size
-        self._checked_s = time.monotonic()
-
-
-class ServerStream(_Stream):
-    """Serves a stream that viewers join, on this machine only unless told otherwise."""
-
-    def __init__(self, options: ViewerOptions, times: StageTimes) -> None:
-        super().__init__(options, times)
-        self.host, self.port = _host_and_port(options.serve_address)
-        try:
-            with socket.create_server((self.host, self.port)):
-                pass
-        except OSError as error:
-            raise ViewerError(
-                f"cannot serve on {options.serve_address}: {error.strerror}. Another program may"
-                " have the port; give --serve-address 127.0.0.1:PORT with a free one."
-            ) from None
-
-    def _target(self) -> rr.GrpcServerSink:
-        return rr.GrpcServerSink(
-            self.host, self.port, server_memory_limit=self.options.serve_memory
-        )
-
-
-class RemoteStream(_Stream):
-    """Sends to a viewer that is open, waits while it stalls, and finds it again if it restarts.
-
-    Each step is sent before the next is taken, so that a stalled viewer costs one step of
-    memory, not the half gigabyte that the SDK would queue.
-
-    Attributes
-    ----------
-    missed : int
-        Steps taken while no viewer was there.
-    """
-
-    def __init__(self, url: str, options: ViewerOptions, times: StageTimes) -> None:
-        super().__init__(options, times)
-        self.url = url
-        self.missed = 0
-        parts = urlsplit(url)
-        if parts.scheme not in ("rerun", "rerun+http", "rerun+https") or not parts.hostname:
-            raise ViewerError(
-                f"'{url}' is no viewer's address; write --connect rerun+http://HOST:PORT/proxy."
-            )
-        self._address = (parts.hostname, parts.port or VIEWER_PORT)
-        self._checked_s = 0.0
-        if not _listens(self._address):
-            raise ViewerError(
-                f"no viewer listens at {url}. Start one there with 'rerun', or leave out --connect."
-            )
-
-    def _target(self) -> rr.GrpcSink:
-        return rr.GrpcSink(self.url)
-
-    def put(self, item: Step | StateNote) -> None:
-        """Log a step and see it off, however long the viewer takes."""
-        if self._stream is None and time.monotonic() - self._checked_s > CHECK_EVERY_S:
-            self._checked_s = time.monotonic()
-            if _listens(self._address):
-                self.open()  # it is back
-        if self._stream is None:
-            self.missed += 1
-            return
-        super().put(item)
-        try:
-            self._stream.flush()
+            self._stream.flush(timeout_sec=timeout_s)
         except RuntimeError:
-            _ABANDONED.append(self._stream)
-            self._stream = None
+            return False
+        return True
 
-    def close(self) -> None:
-        """Let go of the viewer, which keeps what it has."""
-        if self._stream is not None:
-            with contextlib.suppress(RuntimeError):  # it has just been closed: so be it
-                self._stream.flush(timeout_sec=EXIT_S)
-                self._stream.disconnect()
+    def finish(self) -> None:
+        """End it, with its index. Only after a `flush` that worked: else it waits for ever."""
+        self._stream.disconnect()
 
-
-class WindowStream(RemoteStream):
-    """Opens a viewer window, or uses the one that is open, which outlives this program."""
-
-    def __init__(self, options: ViewerOptions, times: StageTimes) -> None:
-        port = VIEWER_PORT
-        if options.serve and _host_and_port(options.serve_address)[1] == VIEWER_PORT:
-            port += 1
-        if not _listens(("127.0.0.1", port)):
-            _start_viewer(port, options.viewer_memory)
-        super().__init__(f"rerun+http://127.0.0.1:{port}/proxy", options, times)
+    def abandon(self) -> None:
+        """Give up on a sink that died: letting go of the stream would wait for it for ever."""
+        _ABANDONED.append(self._stream)
 
 
 _ABANDONED: list[rr.RecordingStream] = []
-"""Streams whose viewer died: letting go of one would wait for that viewer for ever."""
 
 
-def _start_viewer(port: int, memory: str) -> None:
+def never_wait_at_exit() -> None:
+    """Keep the SDK from waiting, when the program ends, for sinks that have died."""
+    rr.unregister_shutdown()
+
+
+def open_window(port: int, memory: str) -> None:
+    """Start a viewer window that listens on a port and outlives this program.
+
+    Raises
+    ------
+    ViewerError
+        If it does not start.
+    """
     try:
         rr.spawn(
             port=port,
@@ -515,14 +384,6 @@ def _start_viewer(port: int, memory: str) -> None:
             f"the viewer window does not start ({str(error).splitlines()[0]}). Use --headless"
             " --save FILE.rrd, and open the file elsewhere."
         ) from None
-    deadline_s = time.monotonic() + 10
-    while not _listens(("127.0.0.1", port)):
-        if time.monotonic() > deadline_s:
-            raise ViewerError(
-                "the viewer window did not start within 10 s. Use --headless --save FILE.rrd, and"
-                " open the file elsewhere."
-            )
-        time.sleep(0.05)
 
 
 def viewer_executable() -> str | None:
@@ -532,112 +393,6 @@ def viewer_executable() -> str | None:
         return None
     native = Path(package.origin).with_name("rerun.exe" if os.name == "nt" else "rerun")
     return str(native) if native.exists() else None
-
-
-def has_display() -> bool:
-    """Whether a window can be opened here."""
-    if sys.platform in ("win32", "darwin"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _listens(address: tuple[str, int]) -> bool:
-    try:
-        with socket.create_connection(address, PROBE_S):
-            return True
-    except OSError:
-        return False
-
-
-def _host_and_port(address: str) -> tuple[str, int]:
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdigit() or not 0 < int(port) < 65536:
-        raise ViewerError(f"'{address}' is no address to serve on; write HOST:PORT, 127.0.0.1:9876")
-    return host.strip("[]"), int(port)
-
-
-# All of it together
-
-
-class Viewer:
-    """Every place where a run is seen, each fed by a thread and a stream of its own.
-
-    Parameters
-    ----------
-    options : ViewerOptions
-        Which places.
-    live : bool
-        A live source waits for nobody: what a place has no time for is dropped there. A
-        recording waits for its file always, and for a viewer that is not stalled.
-    times : StageTimes
-        Where the time that logging takes is added, as stage ``log``.
-
-    Raises
-    ------
-    OutputError, ViewerError
-        If a place cannot be written, reached or opened.
-    """
-
-    def __init__(self, options: ViewerOptions, *, live: bool, times: StageTimes) -> None:
-        shared = options, times
-        self.window = not options.headless and has_display()
-        streams: list[tuple[str, _Stream]] = []
-        if options.save is not None:
-            streams.append((f"file '{options.save}'", FileStream(options.save, *shared)))
-        if options.serve:
-            streams.append((f"served stream on {options.serve_address}", ServerStream(*shared)))
-        if options.connect is not None:
-            streams.append((f"viewer at {options.connect}", RemoteStream(options.connect, *shared)))
-        if self.window:
-            streams.append(("viewer window", WindowStream(*shared)))
-        self._places: list[Handover[Step | StateNote]] = [
-            Handover[Step | StateNote](
-                name,
-                stream,
-                lossless=isinstance(stream, FileStream) and not live,
-                patience_s=0.0 if live else STALL_S,
-                capacity=FILE_QUEUE if isinstance(stream, FileStream) else 2,
-            )
-            for name, stream in streams
-        ]
-        self._file = self._places[0] if options.save is not None else None
-
-    def show(self, item: Step | StateNote) -> None:
-        """Hand a step, or the sensor's state without one, to every place.
-
-        Raises
-        ------
-        Exception
-            What ended the file that was asked for; a viewer that is gone is no error.
-        """
-        for place in self._places:
-            place.offer(item)
-            if place is self._file and place.failure is not None:
-                raise place.failure
-
-    @property
-    def dropped(self) -> dict[str, int]:
-        """Steps that each place has missed, by its name."""
-        return {place.name: place.dropped for place in self._places}
-
-    def close(self) -> list[str]:
-        """Finish every place, within `EXIT_S` each and 3 s in all.
-
-        Returns
-        -------
-        list of str
-            What went wrong, a sentence each.
-        """
-        # From here on the SDK may not wait for anybody at exit: it would wait for ever.
-        rr.unregister_shutdown()
-        deadline_s = time.monotonic() + 2.5
-        troubles = []
-        for place in self._places:
-            if not place.finish(max(0.1, deadline_s - time.monotonic())):
-                troubles.append(f"the {place.name} had stalled and was left behind.")
-            elif place.failure is not None:
-                troubles.append(f"the {place.name} ended early: {place.failure}")
-        return troubles
 
 
 # Pictures of it

@@ -89,6 +89,7 @@ def test_failure_is_told_and_blocks_nobody(lossless: bool) -> None:
     gate.opened.set()
     handover = Handover("file", gate, lossless=lossless, capacity=1)
     handover.offer(-1)
+    gate.busy.wait()
     for item in range(100):
         handover.offer(item)
     assert handover.finish(5)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from selective_depth.app import legend, viewer
+from selective_depth.app import legend, places, viewer
 from selective_depth.app.errors import ViewerError
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.step import Model, StateNote, Step
@@ -75,7 +75,7 @@ def make_step(index: int, *, acquiring: bool = True) -> Step:
 
 def save(path: Path, steps: list[Step], **options: Any) -> None:
     chosen = dataclasses.replace(HEADLESS, save=path, **options)
-    shown = viewer.Viewer(chosen, live=False, times=StageTimes())
+    shown = places.Viewer(chosen, live=False, times=StageTimes())
     for step in steps:
         shown.show(step)
     assert shown.close() == []
@@ -152,7 +152,7 @@ def test_every_view_shows_something_that_was_logged(
 
 def test_sensor_state_is_logged_when_it_changes(tmp_path: Path) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
-    shown = viewer.Viewer(chosen, live=False, times=StageTimes())
+    shown = places.Viewer(chosen, live=False, times=StageTimes())
     shown.show(StateNote("lost"))  # before the first frame there is no time to log it at
     shown.show(make_step(0))
     for state in ("stalled", "stalled", "lost", "reconnecting"):
@@ -182,12 +182,12 @@ def test_colour_limits_hold_for_the_whole_run(tmp_path: Path) -> None:
 def test_unwritable_file_is_refused_at_once(tmp_path: Path, place: str) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / place)
     with pytest.raises(OutputError, match="cannot write"):
-        viewer.Viewer(chosen, live=False, times=StageTimes())
+        places.Viewer(chosen, live=False, times=StageTimes())
 
 
 def test_full_disk_ends_the_file_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
-    shown = viewer.Viewer(chosen, live=False, times=StageTimes())
+    shown = places.Viewer(chosen, live=False, times=StageTimes())
     usage = shutil.disk_usage(tmp_path)
     room = iter([1 << 30] * 3)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=next(room, 1 << 20)))
@@ -206,7 +206,7 @@ def test_full_disk_ends_the_file_whole(tmp_path: Path, monkeypatch: pytest.Monke
 )
 def test_address_that_is_none_is_refused(url: str) -> None:
     with pytest.raises(ViewerError, match="no viewer's address"):
-        viewer.Viewer(dataclasses.replace(HEADLESS, connect=url), live=True, times=StageTimes())
+        places.Viewer(dataclasses.replace(HEADLESS, connect=url), live=True, times=StageTimes())
 
 
 def test_absent_viewer_is_noticed_at_once() -> None:
@@ -215,7 +215,7 @@ def test_absent_viewer_is_noticed_at_once() -> None:
     chosen = dataclasses.replace(HEADLESS, connect=f"rerun+http://127.0.0.1:{port}/proxy")
     start_s = time.monotonic()
     with pytest.raises(ViewerError, match="no viewer listens"):
-        viewer.Viewer(chosen, live=True, times=StageTimes())
+        places.Viewer(chosen, live=True, times=StageTimes())
     assert time.monotonic() - start_s < 2
 
 
@@ -223,7 +223,7 @@ def test_absent_viewer_is_noticed_at_once() -> None:
 def test_serve_address_is_checked(address: str) -> None:
     chosen = dataclasses.replace(HEADLESS, serve=True, serve_address=address)
     with pytest.raises(ViewerError, match="no address"):
-        viewer.Viewer(chosen, live=True, times=StageTimes())
+        places.Viewer(chosen, live=True, times=StageTimes())
 
 
 def test_taken_port_is_refused() -> None:
@@ -232,4 +232,4 @@ def test_taken_port_is_refused() -> None:
             HEADLESS, serve=True, serve_address=f"127.0.0.1:{taken.getsockname()[1]}"
         )
         with pytest.raises(ViewerError, match="cannot serve"):
-            viewer.Viewer(chosen, live=True, times=StageTimes())
+            places.Viewer(chosen, live=True, times=StageTimes())
