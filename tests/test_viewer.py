@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import signal
 import socket
+import subprocess
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -233,3 +236,121 @@ def test_taken_port_is_refused() -> None:
         )
         with pytest.raises(ViewerError, match="cannot serve"):
             places.Viewer(chosen, live=True, times=StageTimes())
+
+
+class Listener:
+    """A Rerun server without a window, to be stopped, killed and started again."""
+
+    def __init__(self) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = int(free.getsockname()[1])
+        self.process = self.start()
+
+    def start(self) -> subprocess.Popen[bytes]:
+        executable = viewer.viewer_executable()
+        assert executable is not None
+        self.process = subprocess.Popen(
+            [executable, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(self.port)],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        deadline_s = time.monotonic() + 10
+        while not places.listens(("127.0.0.1", self.port)):
+            assert time.monotonic() < deadline_s, "the Rerun server did not start"
+            time.sleep(0.02)
+        return self.process
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    @property
+    def options(self) -> ViewerOptions:
+        return dataclasses.replace(HEADLESS, connect=f"rerun+http://127.0.0.1:{self.port}/proxy")
+
+
+@pytest.fixture
+def listener() -> Iterator[Listener]:
+    made = Listener()
+    yield made
+    made.kill()
+
+
+def show_for(shown: places.Viewer, seconds: float, step: Step) -> tuple[int, float]:
+    """Show steps for a while; return how many and the longest time that one took."""
+    count, longest_s = 0, 0.0
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        start_s = time.monotonic()
+        shown.show(step)
+        longest_s = max(longest_s, time.monotonic() - start_s)
+        count += 1
+        time.sleep(0.01)
+    return count, longest_s
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no SIGSTOP on this system")
+def test_stalled_viewer_holds_up_nobody_and_spares_the_file(
+    listener: Listener, tmp_path: Path
+) -> None:
+    options = dataclasses.replace(listener.options, save=tmp_path / "out.rrd")
+    shown = places.Viewer(options, live=True, times=StageTimes())
+    step = make_step(0)
+    show_for(shown, 1.0, step)
+    before = shown.dropped
+    listener.process.send_signal(signal.SIGSTOP)
+    count, longest_s = show_for(shown, 1.5, step)
+    after = shown.dropped
+    file, remote = after
+    assert longest_s < 0.3
+    assert after[remote] - before[remote] > count / 2
+    assert after[file] == before[file]
+    start_s = time.monotonic()
+    troubles = shown.close()
+    assert time.monotonic() - start_s < 3
+    assert len(troubles) == 1
+    assert "stalled" in troubles[0]
+    assert rows_of(tmp_path / "out.rrd")["/camera/depth"] >= count
+
+
+def test_killed_viewer_is_found_again_when_it_is_back(listener: Listener) -> None:
+    shown = places.Viewer(listener.options, live=True, times=StageTimes())
+    step = make_step(0)
+    show_for(shown, 1.0, step)
+    listener.kill()
+    count, longest_s = show_for(shown, 1.0, step)
+    lost = sum(shown.dropped.values())
+    assert longest_s < 0.3
+    assert lost > count / 2
+    listener.start()
+    show_for(shown, 2.5, step)
+    settled = sum(shown.dropped.values())
+    count, _ = show_for(shown, 0.5, step)
+    assert sum(shown.dropped.values()) - settled < count / 2
+    assert shown.close() == []
+
+
+def test_server_that_never_answers_ends_in_time() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        url = f"rerun+http://127.0.0.1:{mute.getsockname()[1]}/proxy"
+        options = dataclasses.replace(HEADLESS, connect=url)
+        shown = places.Viewer(options, live=True, times=StageTimes())
+        _, longest_s = show_for(shown, 0.5, make_step(0))
+        start_s = time.monotonic()
+        troubles = shown.close()
+    assert longest_s < 0.3
+    assert time.monotonic() - start_s < 3
+    assert "left behind" in troubles[0]
+
+
+def test_two_places_see_the_same(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    options = dataclasses.replace(
+        HEADLESS, save=tmp_path / "out.rrd", serve=True, serve_address=address
+    )
+    shown = places.Viewer(options, live=False, times=StageTimes())
+    for index in range(5):
+        shown.show(make_step(index))
+    assert shown.close() == []
+    assert len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)) == 5
