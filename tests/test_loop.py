@@ -1,0 +1,204 @@
+"""The loop: every frame once, time kept, faults of the source survived or told."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from selective_depth.app import session as session_module
+from selective_depth.app import timing
+from selective_depth.app.loop import Loop
+from selective_depth.app.realtime import RealtimeSource
+from selective_depth.app.session import Session
+from selective_depth.app.settings import (
+    AcquireOptions,
+    GasOptions,
+    RunOptions,
+    SeedOptions,
+    Settings,
+    ViewerOptions,
+)
+from selective_depth.app.timing import StageTimes
+from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.source import (
+    DamagedRecordingError,
+    DepthSource,
+    DeviceLostError,
+    SourceEndedError,
+    SourceError,
+    SourceTimeoutError,
+)
+
+HEIGHT, WIDTH = 48, 64
+SMALL = Settings(
+    seeds=SeedOptions(24, 32),
+    gas=GasOptions(nodes=60),
+    viewer=ViewerOptions(headless=True),
+)
+
+
+def make_frame(index: int) -> DepthFrame:
+    depth_mm = np.full((HEIGHT, WIDTH), 2000, dtype=np.uint16)
+    depth_mm[:, WIDTH // 2 + index % 5 :] = 1200
+    depth_mm[10:14, 10:20] = 0
+    return DepthFrame(depth_mm, index, index * 33_333, Camera.kinect(WIDTH, HEIGHT), "made")
+
+
+class Script(DepthSource):
+    """A source that delivers frames and raises errors as it is told."""
+
+    def __init__(self, events: list[int | SourceError], *, live: bool = False) -> None:
+        self.uri = "script"
+        self.camera = Camera.kinect(WIDTH, HEIGHT)
+        self.fps = 30.0
+        self.live = live
+        self.frame_count = None if live else sum(isinstance(each, int) for each in events)
+        self.dropped = 0
+        self.closed = 0
+        self._events = iter(events)
+
+    def read(self, timeout_s: float = 5.0) -> DepthFrame:
+        event = next(self._events, SourceEndedError("the end"))
+        if isinstance(event, SourceError):
+            self.state = "lost" if isinstance(event, DeviceLostError) else "stalled"
+            raise event
+        self.state = "live"
+        return make_frame(event)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, source: DepthSource, settings: Settings = SMALL
+) -> tuple[int, Session]:
+    monkeypatch.setattr(session_module, "open_source", lambda uri: source)
+    session = Session("script", settings)
+    return session.run(), session
+
+
+@pytest.mark.parametrize("budget", [0.0, 0.05])
+def test_replay_takes_every_frame_once(monkeypatch: pytest.MonkeyPatch, budget: float) -> None:
+    source = Script(list(range(7)))
+    settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=budget, rounds=2))
+    code, session = run(monkeypatch, source, settings)
+    report = session.report
+    assert (code, report.frames, report.dropped, report.troubles) == (0, 7, 0, [])
+    assert source.closed == 1
+    expected = {"read", "seeds", "neural_gas", "improvement", "loop"}
+    assert set(report.stages) == expected | ({"acquire", "model"} if budget else set())
+    assert all(times.count == 7 for name, times in report.stages.items() if name != "read")
+    assert report.rmse_mm.count == (7 if budget else 0)
+    assert session.last is not None
+    assert session.last.frame.index == 6
+
+
+def test_frames_limits_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = dataclasses.replace(SMALL, run=RunOptions(frames=3))
+    code, session = run(monkeypatch, Script(list(range(7))), settings)
+    assert (code, session.report.frames) == (0, 3)
+
+
+def test_live_goes_on_through_stall_and_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    gone = [SourceTimeoutError("silent"), DeviceLostError("unplugged"), DeviceLostError("still")]
+    source = Script([0, 1, *gone, 2, 3], live=True)
+    code, session = run(monkeypatch, source)
+    assert (code, session.report.frames) == (0, 4)
+    assert session.report.live
+
+
+def test_damaged_recording_ends_with_what_was_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    damage = DamagedRecordingError("frame 3 of 'walk.oni' is damaged; use check --repair")
+    code, session = run(monkeypatch, Script([0, 1, 2, damage]))
+    assert (code, session.report.frames) == (1, 3)
+    assert session.report.troubles == [str(damage)]
+
+
+def test_replay_that_times_out_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SourceTimeoutError):
+        run(monkeypatch, Script([0, SourceTimeoutError("no frame within 5 s")]))
+
+
+def test_source_is_closed_when_a_selector_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Script([0, 1])
+    monkeypatch.setattr(Loop, "turn", lambda *_: (_ for _ in ()).throw(MemoryError("full")))
+    with pytest.raises(MemoryError):
+        run(monkeypatch, source)
+    assert source.closed == 1
+
+
+def test_saved_run_writes_settings_and_picture_beside(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    viewer = ViewerOptions(headless=True, save=tmp_path / "run.rrd")
+    code, session = run(monkeypatch, Script([0, 1]), dataclasses.replace(SMALL, viewer=viewer))
+    assert code == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"run.rrd", "run.toml", "run.png"}
+    assert set(session.report.written) == set(tmp_path.iterdir())
+
+
+def test_realtime_keeps_time_and_counts_what_nobody_read() -> None:
+    with RealtimeSource(Script(list(range(12)))) as source:
+        first = source.read()
+        time.sleep(0.2)
+        second = source.read()
+        assert first.index == 0
+        assert second.index >= 4  # frames come every 33 ms
+        seen = 2
+        while True:
+            try:
+                source.read()
+            except SourceEndedError:
+                break
+            seen += 1
+        assert seen + source.dropped == 12
+
+
+def test_realtime_passes_faults_on_and_bounds_its_wait() -> None:
+    with RealtimeSource(Script([0, DamagedRecordingError("damaged")])) as source:
+        assert source.read().index == 0
+        with pytest.raises(DamagedRecordingError):
+            source.read()
+    blocked = Script([0])
+    release = threading.Event()
+    blocked.read = lambda timeout_s=5.0: release.wait() and make_frame(0)  # type: ignore[method-assign,assignment]
+    with RealtimeSource(blocked) as source:
+        with pytest.raises(SourceTimeoutError, match=r"within 0\.1 s"):
+            source.read(0.1)
+        release.set()
+
+
+@given(st.lists(st.floats(0, 1e4, width=32), min_size=1, max_size=50))
+def test_stage_times_agree_with_numpy(durations_ms: list[float]) -> None:
+    times = StageTimes()
+    for each in durations_ms:
+        times.add("loop", each)
+    summary = times.summary()["loop"]
+    assert summary.count == len(durations_ms)
+    assert summary.max_ms == max(durations_ms)
+    expected = np.percentile(np.array(durations_ms, dtype=np.float32), (50, 99))
+    np.testing.assert_allclose((summary.p50_ms, summary.p99_ms), expected, rtol=1e-6)
+
+
+def test_stage_times_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(timing, "KEPT", 8)
+    times = StageTimes()
+    for each in [1000.0] + [1.0] * 100:
+        times.add("loop", each)
+    summary = times.summary()["loop"]
+    assert (summary.p50_ms, summary.p99_ms, summary.max_ms) == (1.0, 1.0, 1000.0)
+    assert summary.count == 101
+
+
+def test_failed_stage_is_not_counted() -> None:
+    times = StageTimes()
+    with pytest.raises(ValueError, match="bad"), times.stage("loop"):
+        raise ValueError("bad")
+    assert times.summary() == {}
