@@ -155,9 +155,13 @@ def open_source(uri: str | Path) -> DepthSource:
 
         return RecordedFolder(path)
     if suffix == ".oni":
+        from selective_depth.drivers.oni_reader import OniReader
         from selective_depth.drivers.openni import OpenNIRecording
 
-        return OpenNIRecording(path)
+        try:
+            return OpenNIRecording(path)
+        except RuntimeMissingError:
+            return OniReader(path)  # the same frames, without OpenNI2
     if not path.exists():
         raise SourceNotFoundError(
             f"'{name}' does not exist. Give an .oni file, a folder of 16-bit PNG frames, 'openni'"

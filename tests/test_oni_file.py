@@ -46,6 +46,7 @@ from selective_depth.drivers.source import (
     OutputError,
     SourceEndedError,
     SourceNotFoundError,
+    open_source,
 )
 
 Depth = npt.NDArray[np.uint16]
@@ -156,6 +157,15 @@ def test_a_killed_recording_of_the_real_recorder_comes_back(
         np.testing.assert_array_equal(
             [frame.depth_mm for frame in _read(file)], oni_sample.depth_mm[:8]
         )
+
+
+def test_without_the_runtime_a_recording_opens_all_the_same(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OPENNI2_REDIST", str(tmp_path / "no runtime here"))
+    with open_source(recording) as source:
+        assert isinstance(source, OniReader)
+        _assert_same(list(source), _frames())
 
 
 # Writing and reading
