@@ -20,9 +20,14 @@ from raw_oni_player import Outcome, digest_of, play_all
 
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni_file import inspect_oni
-from selective_depth.drivers.oni_reader import OniReader
+from selective_depth.drivers.oni_reader import OniReader, repair_oni
 from selective_depth.drivers.openni_runtime import find_runtime
-from selective_depth.drivers.source import DepthSource, SourceError, open_source
+from selective_depth.drivers.source import (
+    DamagedRecordingError,
+    DepthSource,
+    SourceError,
+    open_source,
+)
 
 TIME_LIMIT_S = 10.0
 
@@ -38,6 +43,15 @@ def sound(oni_sample: OniSample) -> bytes:
 
 def test_short(sound: bytes, tmp_path: Path) -> None:
     _fuzz(sound, tmp_path, mutated=40, cut=10, seed=1)
+
+
+def test_repaired_files_replay_through_openni2(sound: bytes, tmp_path: Path) -> None:
+    _replay_repaired(sound, tmp_path, mutated=12, cut=6, seed=5)
+
+
+@pytest.mark.slow
+def test_repaired_files_replay_through_openni2_long(sound: bytes, tmp_path: Path) -> None:
+    print(_replay_repaired(sound, tmp_path, mutated=300, cut=40, seed=6))
 
 
 @pytest.mark.slow
