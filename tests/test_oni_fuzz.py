@@ -81,6 +81,36 @@ def _fuzz(sound: bytes, folder: Path, *, mutated: int, cut: int, seed: int) -> C
     return counts
 
 
+def _replay_repaired(
+    sound: bytes, folder: Path, *, mutated: int, cut: int, seed: int
+) -> Counter[str]:
+    """Repair damaged files and give what comes out to OpenNI2; return how many fared how."""
+    damaged, repaired = folder / "damaged.oni", folder / "repaired.oni"
+    names: list[str] = []
+    counts: Counter[str] = Counter()
+
+    def files() -> Iterator[Path]:
+        for name, data in [*cuts(sound, cut), *mutations(sound, mutated, seed)]:
+            damaged.write_bytes(data)
+            repaired.unlink(missing_ok=True)
+            try:
+                repair_oni(damaged, repaired)
+            except DamagedRecordingError:
+                counts["no frame readable"] += 1
+                continue
+            names.append(name)
+            yield repaired
+
+    for outcome in play_all(files(), find_runtime().library):
+        with OniReader(repaired) as reader:
+            frames = [(f.index + 1, *f.shape, f.depth_mm.tobytes()) for f in reader]
+        assert (outcome.frames, outcome.digest) == digest_of(frames), f"{names[-1]}: {outcome}"
+        counts["files repaired"] += 1
+        counts["frames saved"] += outcome.frames
+    assert counts["files repaired"] > 0
+    return counts
+
+
 def _try(name: str, path: Path, outcome: Outcome, expected: list[DepthFrame]) -> Iterator[str]:
     """Check what is made of one damaged file; yield what to count."""
     yield f"OpenNI2 alone: {outcome.ended}"
