@@ -9,14 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.selectors.reconstruct import reconstruct
-from selective_depth.selectors.scores import MISSED, Score, StepScore
+from selective_depth.selectors.samples import Samples
+from selective_depth.selectors.scores import Score, StepScore
 from selective_depth.selectors.seeds import SeedGrid
 
 Measure = Callable[[npt.NDArray[np.int32]], npt.NDArray[np.generic]]
 """A random-access depth sensor: pixels (n, 2), column first, to depth (n,) in mm, 0 = none."""
-
-CROWDED = 0.3
-"""What a shot beside a better one is worth: it will mostly be told the same."""
 
 
 @dataclass(frozen=True)
@@ -94,37 +92,6 @@ def shots_of(budget: float, shape: tuple[int, int]) -> int:
     return int(shots)
 
 
-def choose(
-    score: npt.NDArray[np.float32], shots: int, crowded: float = CROWDED
-) -> npt.NDArray[np.int32]:
-    """Pixels to measure: the best scores, after those beside a better one are marked down.
-
-    Parameters
-    ----------
-    score : float32 array of shape (H, W)
-        Worth of a shot; pixels with 0 are never chosen.
-    shots : int
-        How many at most.
-    crowded : float, default `CROWDED`
-        Factor on pixels that are no maximum of their 3x3 neighbourhood.
-
-    Returns
-    -------
-    int32 array of shape (n, 2)
-        Column first, best first; n <= shots.
-    """
-    import cv2
-
-    peak = score >= cv2.dilate(score, np.ones((3, 3), np.uint8))
-    worth = np.where(peak, score, score * np.float32(crowded)).ravel()
-    shots = min(shots, int(np.count_nonzero(worth > 0)))
-    if shots == 0:
-        return np.empty((0, 2), np.int32)
-    best = np.argpartition(-worth, shots - 1)[:shots]
-    best = best[np.lexsort((best, -worth[best]))]
-    return np.stack((best % score.shape[1], best // score.shape[1]), axis=-1).astype(np.int32)
-
-
 def acquire(
     measure: Measure,
     seeds: SeedGrid,
@@ -163,21 +130,21 @@ def acquire(
         raise ValueError(f"{rounds} rounds were asked for; at least 1 is needed")
     score = StepScore() if selector is None else selector
     shots = shots_of(budget, seeds.frame_shape)
-    samples_mm = np.zeros(seeds.frame_shape, np.float32)
+    samples = Samples.of(seeds)
+    plan = score.plan(samples, threads)
     lattice_uv = seeds.lattice_uv.reshape(-1, 2)
     lattice_mm = seeds.depth_mm.ravel()
-    samples_mm[lattice_uv[:, 1], lattice_uv[:, 0]] = np.where(lattice_mm > 0, lattice_mm, MISSED)
     uv, depth, made = [lattice_uv], [lattice_mm.astype(np.uint16)], []
     for number in range(rounds):
         due = shots * (number + 1) // rounds - sum(r.shots for r in made)
-        new_uv = choose(score.map(samples_mm, threads), due)
+        new_uv = plan.best(due)
         new_mm = np.asarray(measure(new_uv))
         if new_mm.shape != (len(new_uv),):
             raise ValueError(
                 f"the sensor was asked for {len(new_uv)} pixels and answered with shape"
                 f" {new_mm.shape}; it must return one depth per pixel"
             )
-        samples_mm[new_uv[:, 1], new_uv[:, 0]] = np.where(new_mm > 0, new_mm, MISSED)
+        samples.add(new_uv, new_mm)
         uv.append(new_uv)
         depth.append(new_mm.astype(np.uint16))
         made.append(Round(len(new_uv), int(np.count_nonzero(new_mm))))

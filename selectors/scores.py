@@ -4,155 +4,303 @@ Almost all of the error of a sparse depth model sits at depth steps, between a s
 surface and a sample on the other. A pixel there belongs to either, and nobody knows to which:
 its expected squared error is the spread of the depths around it, weighted by how near they are.
 A shot halves the stretch in which the step can lie, so the spread counts the more the farther
-the nearest sample is. Shots that returned nothing mark holes: the chance of a return is the
+the nearest samples are. Shots that returned nothing mark holes: the chance of a return is the
 share of the neighbours that did.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Protocol
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from selective_depth.selectors.choice import best_pixels, choose
 from selective_depth.selectors.parallel import in_bands
-
-MISSED = np.float32(-1)
-"""In an image of samples: measured, nothing returned."""
+from selective_depth.selectors.samples import TILE_PX, Samples
 
 REACH_PX = 6.5
-"""Nothing is said of pixels farther than this from a sample that returned depth."""
+"""No shot farther than this from a sample that returned depth: it would mostly hit a hole."""
+
+VOTE_PX = 9
+"""Samples farther than this have no vote; less than `TILE_PX`, so that tiles can be skipped."""
+
+assert VOTE_PX < TILE_PX
+
+Image = npt.NDArray[np.float32]
 
 
-class Score(Protocol):
-    """Anything that says, from the samples so far, what a shot at each pixel is worth."""
+class Plan(ABC):
+    """An acquisition under way: says, round after round, which pixels to measure next."""
 
-    def map(
-        self, samples_mm: npt.NDArray[np.float32], threads: int | None = None
-    ) -> npt.NDArray[np.float32]:
-        """Worth of a shot at every pixel, 0 where none should be made.
-
-        Parameters
-        ----------
-        samples_mm : float32 array of shape (H, W)
-            Depth of the samples, `MISSED` where a shot returned nothing, 0 where none was made.
-        threads : int, optional
-            Kernel threads; default `default_threads()`.
-        """
-        ...
+    @abstractmethod
+    def best(self, shots: int) -> npt.NDArray[np.int32]:
+        """At most so many pixels, shape (n, 2), column first, from the samples as they are."""
 
 
-def _disk() -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """Offsets (column, row) within `REACH_PX`, nearest first, and their lengths."""
-    reach = int(REACH_PX)
-    v, u = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    length = np.hypot(u, v)
-    inside = (length > 0) & (length <= REACH_PX)
-    order = np.argsort(length[inside], kind="stable")
-    offsets = np.stack((u[inside][order], v[inside][order]), axis=-1)
-    return offsets.astype(np.int32), length[inside][order].astype(np.float32)
+class Score(ABC):
+    """What a measurement is worth at each pixel, from the samples alone."""
+
+    name: str = "score"
+
+    @abstractmethod
+    def map(self, samples: Samples, threads: int | None = None) -> Image:
+        """Worth of a shot at every pixel, float32 (H, W); 0 where none should be made."""
+
+    def plan(self, samples: Samples, threads: int | None = None) -> Plan:
+        """Begin an acquisition that adds its measurements to `samples`."""
+        return _MapPlan(self, samples, threads)
+
+
+@dataclass(frozen=True, eq=False)
+class _MapPlan(Plan):
+    """The plain way: the whole map anew in every round."""
+
+    score: Score
+    samples: Samples
+    threads: int | None
+
+    def best(self, shots: int) -> npt.NDArray[np.int32]:
+        return choose(self.score.map(self.samples, self.threads), shots)
 
 
 @njit(cache=True, nogil=True)
-def _spread(
-    samples_mm: npt.NDArray[np.float32],
-    offsets: npt.NDArray[np.int32],
-    weights: npt.NDArray[np.float32],
-    lengths: npt.NDArray[np.float32],
-    neighbours: int,
+def _score_tiles(
+    tiles: npt.NDArray[np.int64],
+    image_mm: Image,
+    bits: npt.NDArray[np.uint64],
+    weight_of: Image,
+    length_of: Image,
+    half_of: npt.NDArray[np.int64],
+    voters: int,
     gap_px: float,
-    score: npt.NDArray[np.float32],
+    noise_mm2: float,
+    score: Image,
     first: int,
     end: int,
 ) -> None:
-    height, width = samples_mm.shape
-    depth = np.empty(neighbours, np.float32)
-    weight = np.empty(neighbours, np.float32)
-    for v in range(first, end):
-        for u in range(width):
-            score[v, u] = 0
-            if samples_mm[v, u] != 0:
-                continue
-            found = 0
-            returned = np.float32(0)
-            missed = np.float32(0)
-            total = np.float32(0)
-            gap = np.float32(0)
-            for k in range(len(offsets)):
-                y, x = v + offsets[k, 1], u + offsets[k, 0]
-                if y < 0 or y >= height or x < 0 or x >= width:
+    """Score the pixels of the tiles first..end of a list.
+
+    `weight_of` and `length_of` are indexed by squared distance, and so is `half_of`: the
+    greatest whole number whose square is not above it.
+    """
+    height, width = image_mm.shape
+    tile_columns = (width + TILE_PX - 1) // TILE_PX
+    near_sq = np.empty(voters + 1, np.int64)  # squared distances of the voters, nearest first
+    near_mm = np.empty(voters + 1, np.float32)
+    missed_sq = np.empty((2 * VOTE_PX + 1) ** 2, np.int64)
+    reach_sq = int(REACH_PX * REACH_PX)
+    one = np.uint64(1)
+    for k in range(first, end):
+        top = tiles[k] // tile_columns * TILE_PX
+        left = tiles[k] % tile_columns * TILE_PX
+        for v in range(top, min(top + TILE_PX, height)):
+            for u in range(left, min(left + TILE_PX, width)):
+                score[v, u] = 0
+                if image_mm[v, u] != 0:
                     continue
-                z = samples_mm[y, x]
-                if z == 0:
+                found = 0
+                missed = 0
+                farthest = VOTE_PX * VOTE_PX
+                # Rows outward: as voters are found, the window closes in on the pixel.
+                for step in range(2 * VOTE_PX + 1):
+                    dv = (step + 1) // 2 if step & 1 else -(step // 2)
+                    if dv * dv > farthest:
+                        break
+                    y = v + dv
+                    if y < 0 or y >= height:
+                        continue
+                    half = half_of[farthest - dv * dv]
+                    start = u - half + 64  # in the padded bits
+                    word, shift = start >> 6, np.uint64(start & 63)
+                    window = bits[y, word] >> shift
+                    if shift > 0:
+                        window |= bits[y, word + 1] << (np.uint64(64) - shift)
+                    window &= (one << np.uint64(2 * half + 1)) - one
+                    du = -half
+                    while window:
+                        if not window & one:
+                            window >>= one
+                            du += 1
+                            continue
+                        z = image_mm[y, u + du]
+                        d = du * du + dv * dv
+                        if d <= farthest:
+                            if z < 0:
+                                missed_sq[missed] = d
+                                missed += 1
+                            elif found < voters or d < farthest:
+                                at = min(found, voters - 1)
+                                while at > 0 and near_sq[at - 1] > d:
+                                    near_sq[at] = near_sq[at - 1]
+                                    near_mm[at] = near_mm[at - 1]
+                                    at -= 1
+                                near_sq[at] = d
+                                near_mm[at] = z
+                                found = min(found + 1, voters)
+                                if found == voters:
+                                    farthest = near_sq[voters - 1]
+                        window >>= one
+                        du += 1
+                if found == 0 or near_sq[0] > reach_sq:
                     continue
-                if z < 0:
-                    missed += weights[k]
-                    continue
-                if found == 0:
-                    gap = lengths[k]
-                depth[found] = z
-                weight[found] = weights[k]
-                returned += weights[k]
-                total += weights[k] * z
-                found += 1
-                if found == neighbours:
-                    break
-            if found < 2:
-                continue
-            mean = total / returned
-            spread = np.float32(0)
-            for k in range(found):
-                spread += weight[k] * (depth[k] - mean) ** 2
-            score[v, u] = spread / (returned + missed) * min(gap, gap_px)
+                returned = np.float32(0)
+                total = np.float32(0)
+                for i in range(found):
+                    w = weight_of[near_sq[i]]
+                    returned += w
+                    total += w * near_mm[i]
+                mean = total / returned
+                spread = np.float32(0)
+                for i in range(found):
+                    spread += weight_of[near_sq[i]] * (near_mm[i] - mean) ** 2
+                all_weight = returned
+                for i in range(missed):
+                    if missed_sq[i] <= farthest:
+                        all_weight += weight_of[missed_sq[i]]
+                gap = (length_of[near_sq[0]] + length_of[near_sq[min(1, found - 1)]]) / 2
+                score[v, u] = (
+                    (spread / returned + noise_mm2) * (returned / all_weight) * min(gap, gap_px)
+                )
+
+
+@njit(cache=True, nogil=True)
+def _tile_bounds(low_mm: Image, high_mm: Image, gap_px: float, noise_mm2: float) -> Image:
+    """Upper bound of the score in each tile, -1 where nothing is near enough to score."""
+    rows, columns = low_mm.shape
+    bound = np.empty((rows, columns), np.float32)
+    for r in range(rows):
+        for c in range(columns):
+            low, high = np.float32(np.inf), np.float32(0)
+            for y in range(max(r - 1, 0), min(r + 2, rows)):
+                for x in range(max(c - 1, 0), min(c + 2, columns)):
+                    low = min(low, low_mm[y, x])
+                    high = max(high, high_mm[y, x])
+            # A variance is never more than a quarter of the squared range (Popoviciu).
+            bound[r, c] = -1 if low > high else ((high - low) ** 2 / 4 + noise_mm2) * gap_px * 1.001
+    return bound
+
+
+@lru_cache(maxsize=8)
+def _tables(falloff: float) -> tuple[Image, Image, npt.NDArray[np.int64]]:
+    """Weight, length and whole root of every squared distance up to `VOTE_PX` squared."""
+    length = np.sqrt(np.arange(VOTE_PX * VOTE_PX + 1))
+    weight = 1 / (length**falloff + 1)
+    return weight.astype(np.float32), length.astype(np.float32), length.astype(np.int64)
 
 
 @dataclass(frozen=True)
-class StepScore:
+class StepScore(Score):
     """The project's own score: expected squared error, times how far a shot reaches.
 
-    ``P(return) * sum_k w_k (z_k - mean)^2 / sum_k w_k * min(gap, gap_px)`` over the nearest
-    samples that returned depth, with ``w = 1 / (distance^falloff + 1)``; ``P(return)`` is the
-    weight of the samples that returned depth among all that were met on the way to them.
+    ``P(return) * (sum_k w_k (z_k - mean)^2 / sum_k w_k + noise^2) * gap`` over the nearest
+    samples that returned depth. ``w = 1 / (distance^falloff + 1)``; `mean` is their weighted
+    mean; `gap` is the mean distance of the two nearest, at most `gap_px`; ``P(return)`` is the
+    share of their weight in that of all shots as near. Chosen on the `livingroom` and `tabletop`
+    frames; figures in ``app/docs/evaluation.md``.
 
     Parameters
     ----------
-    neighbours : int, default 6
-        Samples that vote.
+    voters : int, default 6
+        How many samples vote. 4 see a step too late, 8 blur it.
     falloff : float, default 3
         How fast a vote fades with distance.
     gap_px : float, default 4
-        Distance to the nearest sample beyond which being farther counts no more.
+        Distance beyond which being farther from the samples counts no more.
+    noise_mm : float, default 1
+        Error expected even where all neighbours agree; it spends what is left of a budget on
+        the widest gaps.
     """
 
-    neighbours: int = 6
+    voters: int = 6
     falloff: float = 3.0
     gap_px: float = 4.0
-    _disk: tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]] = field(
-        default_factory=_disk, repr=False, compare=False
-    )
+    noise_mm: float = 1.0
+    name = "step score"
 
-    def map(
-        self, samples_mm: npt.NDArray[np.float32], threads: int | None = None
-    ) -> npt.NDArray[np.float32]:
-        """Worth of a shot at every pixel (see `Score.map`)."""
-        offsets, lengths = self._disk
-        weights = (1 / (lengths**self.falloff + 1)).astype(np.float32)
-        score = np.empty(samples_mm.shape, np.float32)
+    def map(self, samples: Samples, threads: int | None = None) -> Image:
+        """Score of every pixel (see `Score.map`)."""
+        score = np.empty(samples.shape, np.float32)
+        self._score(samples, np.arange(samples.stale.size), score, threads)
+        return score
+
+    def plan(self, samples: Samples, threads: int | None = None) -> Plan:
+        """Begin an acquisition; same choice as by the whole map, at a fraction of the work."""
+        return _StepPlan(self, samples, threads)
+
+    def _score(
+        self,
+        samples: Samples,
+        tiles: npt.NDArray[np.int64],
+        score: Image,
+        threads: int | None,
+    ) -> None:
+        weight_of, length_of, half_of = _tables(self.falloff)
         in_bands(
-            lambda first, end: _spread(
-                samples_mm,
-                offsets,
-                weights,
-                lengths,
-                self.neighbours,
+            lambda first, end: _score_tiles(
+                tiles,
+                samples.image_mm,
+                samples.bits,
+                weight_of,
+                length_of,
+                half_of,
+                self.voters,
                 self.gap_px,
+                self.noise_mm**2,
                 score,
                 first,
                 end,
             ),
-            len(samples_mm),
+            len(tiles),
             threads,
         )
-        return score
+
+    def _bounds(self, samples: Samples) -> Image:
+        return _tile_bounds(samples.low_mm, samples.high_mm, self.gap_px, self.noise_mm**2)
+
+
+class _StepPlan(Plan):
+    """Scores only tiles that have changed and can hold one of the best pixels.
+
+    The range of the depths around a tile bounds its scores. If enough pixels reach a threshold,
+    tiles bounded below it cannot matter; if not, the threshold is lowered. The pixels chosen
+    are those that the whole map would give.
+    """
+
+    def __init__(self, score: StepScore, samples: Samples, threads: int | None) -> None:
+        self._rule = score
+        self._samples = samples
+        self._threads = threads
+        self._map = np.zeros(samples.shape, np.float32)
+        self._current = np.zeros(samples.stale.shape, np.bool_)  # tiles whose scores are true
+        self._threshold = np.float32(np.inf)
+
+    def best(self, shots: int) -> npt.NDArray[np.int32]:
+        samples = self._samples
+        outdated = samples.stale & self._current
+        self._current[outdated] = False
+        samples.stale[:] = False
+        bound = self._rule._bounds(samples)
+        least = self._first_threshold(bound, shots)
+        while True:
+            wanted = bound >= least
+            due = np.flatnonzero(wanted & ~self._current)
+            self._rule._score(samples, due, self._map, self._threads)
+            self._current |= wanted
+            chosen, worst = best_pixels(
+                self._map, np.flatnonzero(wanted), shots, least, self._current, self._threads
+            )
+            if len(chosen) == shots or least <= 0:
+                self._threshold = worst
+                return chosen
+            least = least / 16 if least > self._rule.noise_mm**2 else np.float32(0)
+
+    def _first_threshold(self, bound: Image, shots: int) -> np.float32:
+        """A guess: what the last round ended at, or the tiles that could hold the best."""
+        if np.isfinite(self._threshold):
+            return np.float32(self._threshold * 0.5)
+        tiles = min(8 * shots // TILE_PX**2 + 1, bound.size)
+        return max(np.float32(0), np.partition(bound.ravel(), bound.size - tiles)[-tiles])

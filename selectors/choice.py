@@ -1,0 +1,131 @@
+"""Which pixels to measure, given what each is worth: the best, but not in clumps."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from selective_depth.selectors.parallel import in_bands
+from selective_depth.selectors.samples import TILE_PX
+
+CROWDED = np.float32(0.6)
+"""Factor on the worth of a pixel beside a better one, whose shot will mostly tell the same.
+
+With 1 shots clump; with 0 (3x3 maxima first, whatever they are worth) they are wasted on maxima
+of nothing as soon as the good ones are gone. Between .3 and .7 it hardly matters."""
+
+
+@njit(cache=True, nogil=True)
+def _gather(
+    score: npt.NDArray[np.float32],
+    tiles: npt.NDArray[np.int64],
+    current: npt.NDArray[np.bool_],
+    least: float,
+    crowded: float,
+    pixel: npt.NDArray[np.int64],
+    worth: npt.NDArray[np.float32],
+    first: int,
+    end: int,
+) -> int:
+    """Pixels of the tiles first..end worth at least `least`, written from first's place on."""
+    height, width = score.shape
+    tile_columns = current.shape[1]
+    at = first * TILE_PX * TILE_PX
+    for k in range(first, end):
+        top, left = tiles[k] // tile_columns * TILE_PX, tiles[k] % tile_columns * TILE_PX
+        for v in range(top, min(top + TILE_PX, height)):
+            for u in range(left, min(left + TILE_PX, width)):
+                s = score[v, u]
+                if s <= 0 or s < least:
+                    continue
+                better = False
+                for y in range(max(v - 1, 0), min(v + 2, height)):
+                    for x in range(max(u - 1, 0), min(u + 2, width)):
+                        # A tile that is not current holds nothing as good as `least`.
+                        if score[y, x] > s and current[y // TILE_PX, x // TILE_PX]:
+                            better = True
+                if better:
+                    s *= crowded
+                    if s < least:
+                        continue
+                pixel[at] = v * width + u
+                worth[at] = s
+                at += 1
+    return at - first * TILE_PX * TILE_PX
+
+
+def best_pixels(
+    score: npt.NDArray[np.float32],
+    tiles: npt.NDArray[np.int64],
+    shots: int,
+    least: float,
+    current: npt.NDArray[np.bool_],
+    threads: int | None = None,
+    crowded: float = CROWDED,
+) -> tuple[npt.NDArray[np.int32], np.float32]:
+    """The pixels of some tiles that are worth most, and what the last of them is worth.
+
+    Parameters
+    ----------
+    score : float32 array of shape (H, W)
+        Worth of a shot at each pixel; those with 0 are never chosen.
+    tiles : int array
+        Tiles of `TILE_PX` to choose from, numbered row by row.
+    shots : int
+        How many pixels at most.
+    least : float
+        Pixels worth less are left out.
+    current : bool array of shape (rows, columns)
+        Tiles whose scores hold; others are taken to be worth less than `least`.
+    threads : int, optional
+        Kernel threads.
+    crowded : float, default `CROWDED`
+        Factor on pixels with a better one among their eight neighbours.
+
+    Returns
+    -------
+    uv : int32 array of shape (n, 2)
+        Column first, row by row of the image; n <= shots.
+    worst : float32
+        Worth of the last one chosen, 0 if there is none.
+    """
+    room = len(tiles) * TILE_PX * TILE_PX
+    pixel, worth = np.empty(room, np.int64), np.empty(room, np.float32)
+    parts: list[tuple[int, int]] = []
+
+    def band(first: int, end: int) -> None:
+        count = _gather(score, tiles, current, least, crowded, pixel, worth, first, end)
+        parts.append((first * TILE_PX * TILE_PX, count))
+
+    if shots > 0 and len(tiles):
+        in_bands(band, len(tiles), threads)
+    runs = [slice(start, start + count) for start, count in sorted(parts)]
+    pixel = np.concatenate([pixel[run] for run in runs]) if runs else pixel[:0]
+    worth = np.concatenate([worth[run] for run in runs]) if runs else worth[:0]
+    if len(pixel) > shots:
+        worst = np.partition(worth, len(worth) - shots)[-shots]
+        sure = worth > worst
+        ties = np.flatnonzero(worth == worst)
+        # Of equals, take some from everywhere rather than the topmost.
+        scatter = (pixel[ties] * 2654435761) & 0xFFFFFFFF
+        sure[ties[np.argsort(scatter)[: shots - np.count_nonzero(sure)]]] = True
+        pixel, worth = pixel[sure], worth[sure]
+    else:
+        worst = worth.min() if len(worth) else np.float32(0)
+    pixel.sort()
+    width = score.shape[1]
+    return np.stack((pixel % width, pixel // width), axis=-1).astype(np.int32), worst
+
+
+def choose(
+    score: npt.NDArray[np.float32],
+    shots: int,
+    *,
+    crowded: float = CROWDED,
+    threads: int | None = None,
+) -> npt.NDArray[np.int32]:
+    """The pixels of a whole map that are worth most (see `best_pixels`)."""
+    tiles = -(-score.shape[0] // TILE_PX), -(-score.shape[1] // TILE_PX)
+    current = np.ones(tiles, np.bool_)
+    return best_pixels(score, np.arange(current.size), shots, 0.0, current, threads, crowded)[0]
