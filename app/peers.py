@@ -74,20 +74,24 @@ def pykrige_seconds(seeds: SeedGrid) -> float:
     return first + per_pixel * (len(everywhere) - few)
 
 
-def numpy_neural_gas_seconds(points_mm: Points, nodes: int, epochs: int) -> float:
-    """Time a plain NumPy loop of eq. (1)-(4) over 3,000 steps, scaled to the whole training."""
-    rng = np.random.default_rng(0)
+def numpy_neural_gas(points_mm: Points, nodes: int, rng: np.random.Generator) -> Points:
+    """Train neural gas by a plain NumPy loop of eq. (1)-(4), `NUMPY_STEPS` steps."""
     weights = points_mm[rng.integers(len(points_mm), size=nodes)].copy()
-    draws = rng.integers(len(points_mm), size=NUMPY_STEPS)
-    start = time.perf_counter()
-    for step, draw in enumerate(draws):
+    for step, draw in enumerate(rng.integers(len(points_mm), size=NUMPY_STEPS)):
         progress = step / NUMPY_STEPS
         rate = 0.5 * (0.005 / 0.5) ** progress
         reach = nodes / 2 * (0.01 / (nodes / 2)) ** progress
         away = points_mm[draw] - weights
         rank = np.empty(nodes, dtype=np.int64)
         rank[np.argsort(np.einsum("ij,ij->i", away, away))] = np.arange(nodes)
-        weights += (rate * np.exp(-rank / reach))[:, None] * away
+        weights += (rate * np.exp(-rank / reach))[:, None].astype(np.float32) * away
+    return weights
+
+
+def numpy_neural_gas_seconds(points_mm: Points, nodes: int, epochs: int) -> float:
+    """Time `numpy_neural_gas` over 3,000 steps, scaled to a whole training."""
+    start = time.perf_counter()
+    numpy_neural_gas(points_mm, nodes, np.random.default_rng(0))
     spent = time.perf_counter() - start
     return spent / NUMPY_STEPS * epochs * len(points_mm)
 
