@@ -114,7 +114,7 @@ def kinect_depth(
         Millimetres, 0 = no measurement.
     """
     height, width = nearness.shape
-    state = np.array([(seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019) % 2**64], np.uint64)
+    state = np.array([(seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019) % 2**64 or 1], np.uint64)
     error = _field(1, _ERROR_CELL, height, width, state)
     wobble = _field(3, _WOBBLE_CELL, height, width, state)
     strength = np.empty((height, width), np.float32)

@@ -62,7 +62,7 @@ class VirtualSource(DepthSource):
         options = Options(text, f"virtual:{asked}")
         self._noise = options.choice("noise", "kinect", ("kinect", "off")) == "kinect"
         frames = options.integer("frames", 0, 0, 10_000_000)
-        self.seed = options.integer("seed", 1, 0, 2**63 - 1)
+        self.seed = options.integer("seed", 1, 0, 2**32 - 1)
         self._speed = options.number("speed", 1.0, 0.0, 100.0)
         width, height = options.size("size", (640, 480))
         self.live = options.choice("live", "0", ("0", "1")) == "1"

@@ -240,6 +240,14 @@ def test_neighbours_share_part_of_their_error():
     assert abs(beside[2]) < 0.06
 
 
+def test_errors_of_two_frames_have_nothing_in_common():
+    errors = [
+        in_steps(measured(wall(2005), seed=k)[:, :-9].astype(float)) for k in (1, 2, 3, 2**32)
+    ]
+    likeness = np.corrcoef([error.ravel() for error in errors])
+    assert np.abs(likeness - np.eye(4)).max() < 0.03
+
+
 def test_the_projector_casts_a_shadow_to_the_left_of_a_nearer_surface():
     nearness = wall(2400)
     nearness[100:380, 300:420] = 1 / 1200
