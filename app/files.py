@@ -38,6 +38,12 @@ def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
             mended = repair_oni(path, repair)
         say(f"wrote {repair}: {mended.readable_frames} depth frames, whole")
         return OK
+    if report.swapped_frames:
+        say(
+            f"note: OpenNI2's recorder swapped the last pixels of {report.swapped_frames} frames;"
+            " they are read rightly here, but its own player shows them wrong. --repair OUT.oni"
+            " writes a file without the flaw"
+        )
     if not report.complete and report.readable_frames:
         say(
             f"note: save what is readable with --repair OUT.oni, or as PNG files with"

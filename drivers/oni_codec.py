@@ -108,6 +108,21 @@ def encode_depth(depth_mm: _Depth) -> bytes:
     return head + coded[:used].tobytes()
 
 
+def mend_order(payload: bytes, height: int, width: int) -> bytes | None:
+    """The ``16zT`` payload as OpenNI2 should have written it, None where it did.
+
+    Only where the flaw that is described above shows: in a run before a last pixel of another
+    depth. The mended payload has the same length, so it can be written in place.
+    """
+    last, run = payload[-2:] if len(payload) > 4 else b"\0\0"
+    if last & 0x0F != 0x0D or last >> 4 == 6 or not 0xE1 <= run <= 0xEF:
+        return None
+    depth_mm = decode_depth(CODEC_TABLE, payload, height, width)
+    mended = payload[:-2] + bytes((run, last))
+    # The two bytes may be parts of other codes.
+    return mended if depth_mm is not None and encode_depth(depth_mm) == mended else None
+
+
 @njit(cache=True, nogil=True)
 def _signed(value: np.integer) -> int:
     # Numba turns unsigned minus signed into floating point.

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from selective_depth.drivers.frame import Camera
-from selective_depth.drivers.oni_codec import CODEC_TABLE, DEPTH_CODECS, decode_depth
+from selective_depth.drivers.oni_codec import CODEC_TABLE, DEPTH_CODECS, decode_depth, mend_order
 from selective_depth.drivers.oni_records import (
     BEGIN_FIELDS,
     FILE_HEADER,
@@ -150,6 +150,9 @@ class OniReport:
         True for versions before 1.0.1.0.
     decoded_frames : int
         Number of depth frames that were also decoded, not only found.
+    swapped_frames : int
+        Number of these in which OpenNI2's recorder swapped the last pixels, so that its player
+        shows up to 29 wrong ones (see `oni_codec`). They are read rightly here.
     """
 
     path: Path
@@ -164,6 +167,7 @@ class OniReport:
     tail_bytes: int
     old: bool
     decoded_frames: int
+    swapped_frames: int
 
     @property
     def readable_frames(self) -> int:
@@ -249,13 +253,13 @@ class _Inspection:
             self._walk()
             self._check_counts()
         depth = next((n for n in self.nodes.values() if n.node_type == NodeType.DEPTH), None)
-        camera, fps, decoded = None, 30.0, 0
+        camera, fps, decoded, swapped = None, 30.0, 0, 0
         if depth is not None:
             camera, fps = self._check_depth(depth)
             if camera is None:
                 depth.frames.clear()
             elif decode:
-                decoded = self._decode_frames(depth, camera)
+                decoded, swapped = self._decode_frames(depth, camera)
         elif self.version:
             self._problem(0, "the file holds no depth stream")
         return OniReport(
@@ -271,6 +275,7 @@ class _Inspection:
             tail_bytes=0 if self.end is None else self.size - self.end,
             old=self.old,
             decoded_frames=decoded,
+            swapped_frames=swapped,
         )
 
     def _problem(self, offset: int, sentence: str, *, harmless: bool = False) -> None:
@@ -532,19 +537,24 @@ class _Inspection:
                 self._problem(node.offset, f"{error}")
         return Camera.kinect(width, height)
 
-    def _decode_frames(self, node: OniNode, camera: Camera) -> int:
-        """Drop the frames that cannot be decoded; return how many can, as far as time allows."""
-        decoded, sound = 0, []
+    def _decode_frames(self, node: OniNode, camera: Camera) -> tuple[int, int]:
+        """Drop the frames that cannot be decoded, as far as time allows.
+
+        Returns how many can, and how many of these the recorder swapped the last pixels of.
+        """
+        decoded, swapped, sound = 0, 0, []
+        size = camera.height, camera.width
         for frame in node.frames:
             if time.monotonic() < self.deadline:
                 payload = read_payload(self.file, frame)
-                if decode_depth(node.codec, payload, camera.height, camera.width) is None:
+                if decode_depth(node.codec, payload, *size) is None:
                     self._problem(frame.record_offset, f"frame {frame.number} cannot be decoded")
                     continue
                 decoded += 1
+                swapped += node.codec == CODEC_TABLE and mend_order(payload, *size) is not None
             sound.append(frame)
         node.frames[:] = sound
-        return decoded
+        return decoded, swapped
 
 
 def _skip_hole(file: BinaryIO, offset: int) -> int:

@@ -10,7 +10,7 @@ from typing import BinaryIO
 import numpy as np
 
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.oni_codec import decode_depth
+from selective_depth.drivers.oni_codec import CODEC_TABLE, decode_depth, mend_order
 from selective_depth.drivers.oni_file import CODECS, OniFrame, OniReport, inspect_oni, read_payload
 from selective_depth.drivers.oni_records import NodeAddition
 from selective_depth.drivers.oni_writer import RecordWriter, depth_properties
@@ -18,6 +18,7 @@ from selective_depth.drivers.recorded import FolderWriter
 from selective_depth.drivers.source import (
     DamagedRecordingError,
     DepthSource,
+    OutputError,
     SourceEndedError,
     SourceNotFoundError,
 )
@@ -111,7 +112,8 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
     """Write what is readable of an .oni file to a new one that OpenNI2 replays.
 
     Every stream is kept, compressed as it was; frames that are damaged are left out and the rest
-    numbered anew; times that run backwards are interpolated. A file whose recorder was killed
+    numbered anew; times that run backwards are interpolated; last pixels that OpenNI2's recorder
+    swapped are put right (see `mend_oni`). A file whose recorder was killed
     comes back whole.
 
     Parameters
@@ -153,10 +155,50 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
                 frames += [(node.number, *item) for item in zip(node.frames, times_us, strict=True)]
             writer.begin()
             for number, frame, time_us in sorted(frames, key=lambda item: item[1].record_offset):
-                writer.add_frame(number, time_us, read_payload(file, frame))
+                payload = read_payload(file, frame)
+                if number == report.depth.number:
+                    payload = _mended_payload(report, payload) or payload
+                writer.add_frame(number, time_us, payload)
         finally:
             writer.close()
     return inspect_oni(out_path, decode=True, timeout_s=float("inf"))
+
+
+def mend_oni(path: str | Path) -> int:
+    """Put right, in place, the frames whose last pixels OpenNI2's recorder swapped.
+
+    To be called after recording: the file is whole, but OpenNI2's own player and viewers would
+    show up to 29 wrong pixels in the corner of such a frame (see `oni_codec`). Two bytes of each
+    such frame change places, nothing else is touched.
+
+    Returns
+    -------
+    int
+        Number of frames put right.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If there is no such file.
+    OutputError
+        If it cannot be written.
+    """
+    report = inspect_oni(path)
+    frames = report.depth.frames if report.depth is not None else []
+    mended = 0
+    try:
+        with Path(path).open("r+b", buffering=0) as file:
+            for frame in frames:
+                payload = _mended_payload(report, read_payload(file, frame))
+                if payload is not None:
+                    file.seek(frame.payload_offset + frame.payload_size - 2)
+                    file.write(payload[-2:])
+                    mended += 1
+    except OSError as error:
+        raise OutputError(
+            f"'{path}' cannot be written ({error.strerror}); check its permissions."
+        ) from error
+    return mended
 
 
 def export_oni(
@@ -238,6 +280,12 @@ def _mended_times(frames: list[OniFrame]) -> list[int]:
     first_us = frames[kept[0]].timestamp_us  # floating point is exact for what is left
     since_us = [frames[index].timestamp_us - first_us for index in kept]
     return [first_us + round(us) for us in np.interp(range(len(frames)), kept, since_us)]
+
+
+def _mended_payload(report: OniReport, payload: bytes) -> bytes | None:
+    if report.depth is None or report.camera is None or report.depth.codec != CODEC_TABLE:
+        return None
+    return mend_order(payload, report.camera.height, report.camera.width)
 
 
 def _rescuable(path: str | Path) -> OniReport:

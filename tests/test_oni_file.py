@@ -15,11 +15,12 @@ import pytest
 from conftest import OniSample
 from oni_mutations import cuts, mutations
 from raw_oni_player import digest_of, play_all
+from virtual_sensor import record_oni
 
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.oni_codec import CODEC_NONE, CODEC_TABLE, encode_depth
 from selective_depth.drivers.oni_file import OniReport, inspect_oni
-from selective_depth.drivers.oni_reader import OniReader, export_oni, repair_oni
+from selective_depth.drivers.oni_reader import OniReader, export_oni, mend_oni, repair_oni
 from selective_depth.drivers.oni_records import (
     BEGIN_FIELDS,
     FILE_HEADER,
@@ -133,6 +134,31 @@ def test_the_real_player_delivers_what_is_written_and_what_is_repaired(
         )
         assert (outcome.ended, outcome.frames) == ("frames", count), path.name
         assert (outcome.frames, outcome.digest) == expected, path.name
+
+
+@pytest.mark.openni
+def test_what_openni2s_recorder_swaps_is_read_rightly_and_can_be_mended_in_place(
+    virtual_driver: Path, tmp_path: Path
+) -> None:
+    """A lone last pixel after a run: the recorder's flaw, seen on real frames of a Kinect."""
+    depth = np.full((3, 480, 640), 1000, np.uint16)
+    depth[:, 0, 0] = 3000
+    depth[1:, -1, -1] = 1001
+    path, out = tmp_path / "swapped.oni", tmp_path / "repaired.oni"
+    record_oni(depth, path)
+    library = find_runtime().library
+    wrong = next(play_all([path], library))
+    report = inspect_oni(path, decode=True)
+    assert report.complete and report.swapped_frames == 2
+    np.testing.assert_array_equal([frame.depth_mm for frame in _read(path)], depth)
+    right = digest_of((number + 1, 480, 640, depth[number].tobytes()) for number in range(3))
+    assert (wrong.frames, wrong.digest) != right
+
+    assert repair_oni(path, out).swapped_frames == 0
+    assert mend_oni(path) == 2
+    assert mend_oni(path) == 0
+    for outcome in play_all([path, out], library):
+        assert (outcome.frames, outcome.digest) == right
 
 
 @pytest.mark.openni
@@ -517,8 +543,9 @@ def test_hundreds_of_damaged_files_give_frames_or_named_errors_and_can_be_repair
 
 
 def test_what_is_no_file_is_said_at_once(tmp_path: Path) -> None:
-    with pytest.raises(SourceNotFoundError, match="does not exist"):
-        inspect_oni(tmp_path / "none.oni")
+    for asking in (inspect_oni, mend_oni, OniReader):
+        with pytest.raises(SourceNotFoundError, match="does not exist"):
+            asking(tmp_path / "none.oni")
     with pytest.raises(SourceNotFoundError, match="is a folder"):
         inspect_oni(tmp_path)
     with pytest.raises(SourceNotFoundError, match="cannot be read"):

@@ -122,7 +122,7 @@ def _try(name: str, path: Path, outcome: Outcome, expected: list[DepthFrame]) ->
     read, error = _deliver_timed(name, path, OniReader)
     _assert_valid(name, read, expected)
     yield f"read here: {error or 'all frames'}"
-    if thorough:
+    if thorough and not inspect_oni(path, decode=True).swapped_frames:
         digest = digest_of((f.index + 1, *f.shape, f.depth_mm.tobytes()) for f in read)
         assert (outcome.frames, outcome.digest) == digest, f"{name}: OpenNI2 delivers other frames"
 
