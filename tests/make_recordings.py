@@ -11,8 +11,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent))
 from virtual_sensor import record_oni
 
 from selective_depth.drivers.recorded import write_folder
