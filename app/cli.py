@@ -22,10 +22,12 @@ from selective_depth.app.command import (
 from selective_depth.app.errors import AppError, UsageError
 from selective_depth.app.settings import (
     AcquireOptions,
+    Flag,
     GasOptions,
     ImprovementOptions,
     SeedOptions,
     Settings,
+    optional,
 )
 
 OK, FAILED, MISUSED, INTERRUPTED = 0, 1, 2, 130
@@ -39,6 +41,7 @@ EXAMPLES = (
 )
 
 Source = Annotated[str, arg(metavar="SOURCE")]
+SourceOrSample = Annotated[str, optional("SOURCE")]
 Options = Annotated[Settings, arg(name="")]
 DEFAULTS = Settings()
 
@@ -51,15 +54,13 @@ DEFAULTS = Settings()
     (f"{PROGRAM} replay virtual:firehose --budget 0.05 --rounds 4", "and measure 5 % more"),
     (f"{PROGRAM} replay walk.oni --realtime --serve", "as live, for viewers elsewhere to join"),
 )
-def replay(source: Source = "", /, settings: Options = DEFAULTS) -> int:
+def replay(source: SourceOrSample = "", /, settings: Options = DEFAULTS) -> int:
     """Replay a recording through both selectors.
 
     Parameters
     ----------
     source : str
-        A recording (.oni), a folder of 16-bit PNG frames, an object (.ply), or a made scene
-        (virtual:workstation, virtual:ball, virtual:firehose); by default the recording that
-        comes with the program.
+        An .oni file, a folder of PNG frames, a .ply object or virtual:SCENE; else the sample.
     settings : Settings
         All options.
     """
@@ -75,9 +76,7 @@ def replay(source: Source = "", /, settings: Options = DEFAULTS) -> int:
     (f"{PROGRAM} live --headless --save demo.rrd --frames 300", "ten seconds, to a file"),
     (f"{PROGRAM} live --serve --serve-address 0.0.0.0:9876", "for viewers on other machines"),
 )
-def live(
-    device: Annotated[str, arg(metavar="DEVICE")] = "", /, settings: Options = DEFAULTS
-) -> int:
+def live(device: Annotated[str, optional("DEVICE")] = "", /, settings: Options = DEFAULTS) -> int:
     """Watch a sensor through both selectors; end with Ctrl-C.
 
     Parameters
@@ -100,11 +99,11 @@ def live(
 )
 def record(
     out: Annotated[Path, arg(metavar="OUT.oni")],
-    device: Annotated[str, arg(metavar="DEVICE")] = "",
+    device: Annotated[str, optional("DEVICE")] = "",
     /,
-    frames: Annotated[int | None, arg(metavar="N")] = None,
-    seconds: Annotated[float | None, arg(metavar="SECONDS")] = None,
-    overwrite: bool = False,
+    frames: Annotated[int | None, optional("N")] = None,
+    seconds: Annotated[float | None, optional("SECONDS")] = None,
+    overwrite: Flag = False,
 ) -> int:
     """Record a sensor to an .oni file, and make sure that every frame is in it.
 
@@ -142,7 +141,7 @@ def devices() -> int:
 def check(
     file: Annotated[Path, arg(metavar="FILE.oni")],
     /,
-    repair: Annotated[Path | None, arg(metavar="OUT.oni")] = None,
+    repair: Annotated[Path | None, optional("OUT.oni")] = None,
     timeout: Annotated[float, arg(metavar="SECONDS")] = 10.0,
 ) -> int:
     """Say whether a recording is whole; needs no OpenNI2.
@@ -171,7 +170,7 @@ def export(
     source: Source,
     out: Annotated[Path, arg(metavar="OUT")],
     /,
-    frames: Annotated[int | None, arg(metavar="N")] = None,
+    frames: Annotated[int | None, optional("N")] = None,
 ) -> int:
     """Save the frames of a source as PNG files, or as an .oni file; needs no OpenNI2.
 
@@ -197,7 +196,7 @@ def screenshot(
     recording: Annotated[Path, arg(metavar="FILE.rrd")],
     picture: Annotated[Path, arg(metavar="FILE.png")],
     /,
-    frame: Annotated[int | None, arg(metavar="N")] = None,
+    frame: Annotated[int | None, optional("N")] = None,
 ) -> int:
     """Take a picture of the viewer without a display; it needs a graphics driver.
 
@@ -267,11 +266,11 @@ def snapshot(
     (f"{PROGRAM} bench frames/ --json out.json", "on your own, to a file as well"),
 )
 def bench(
-    source: Annotated[str, arg(metavar="SOURCE")] = "",
+    source: SourceOrSample = "",
     /,
-    frames: Annotated[int | None, arg(metavar="N")] = None,
-    json: Annotated[Path | None, arg(metavar="FILE")] = None,
-    page: Annotated[Path | None, arg(metavar="FILE.md")] = None,
+    frames: Annotated[int | None, optional("N")] = None,
+    json: Annotated[Path | None, optional("FILE")] = None,
+    page: Annotated[Path | None, optional("FILE.md")] = None,
     peers: bool = True,
 ) -> None:
     """Time every stage of the loop, and the same work in other libraries, on this machine.
@@ -302,6 +301,9 @@ def run(arguments: Sequence[str]) -> int:
     verbose = _take(words, "-v", "--verbose")
     try:
         return _dispatch(words, verbose)
+    except BrokenPipeError:  # whoever read the output has seen enough, as in `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
     except KeyboardInterrupt:
         _say("interrupted.")
         return INTERRUPTED

@@ -34,7 +34,7 @@ from typing import Any
 from selective_depth.app.errors import UsageError
 
 PROGRAM = "selective-depth"
-SHELLS = ("bash", "zsh", "tcsh")
+SHELLS = ("bash", "zsh")
 Run = Callable[..., int | None]
 Example = tuple[str, str]
 
@@ -150,11 +150,18 @@ def invoke(name: str, arguments: Sequence[str]) -> int:
         If the arguments are not what the command's signature asks for.
     """
     chosen = find(name)
-    call = _parse(chosen, arguments)
+    call = parse(chosen, arguments)
     return call() or 0
 
 
-def _parse(chosen: Command, arguments: Sequence[str]) -> Callable[[], int | None]:
+def parse(chosen: Command, arguments: Sequence[str]) -> Callable[[], int | None]:
+    """Return a command's call with its arguments, without running it.
+
+    Raises
+    ------
+    UsageError
+        As for `invoke`.
+    """
     import tyro
 
     received: list[tuple[tuple[Any, ...], dict[str, Any]]] = []

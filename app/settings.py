@@ -9,6 +9,14 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
+Flag = Annotated[bool, arg(help_behavior_hint="")]
+"""An option without a value; that it is off by default goes without saying."""
+
+
+def optional(metavar: str) -> Any:
+    """Describe an option whose help tells what holds without it."""
+    return arg(metavar=metavar, help_behavior_hint="")
+
 
 @dataclass(frozen=True)
 class SeedOptions:
@@ -62,9 +70,9 @@ class AcquireOptions:
 class RunOptions:
     """How long and how fast."""
 
-    frames: Annotated[int | None, arg(metavar="N")] = None
+    frames: Annotated[int | None, optional("N")] = None
     """Stop after this many frames; by default at the end of the recording, or with Ctrl-C."""
-    realtime: bool = False
+    realtime: Flag = False
     """Replay at the recorded rate, the newest frame first, as a sensor would deliver."""
 
 
@@ -72,25 +80,25 @@ class RunOptions:
 class ViewerOptions:
     """Where the results are seen: any of these, together."""
 
-    headless: bool = False
+    headless: Flag = False
     """Open no viewer window."""
-    save: Annotated[Path | None, arg(metavar="FILE")] = None
+    save: Annotated[Path | None, optional("FILE")] = None
     """Write everything to a Rerun recording (.rrd), and the settings beside it."""
-    serve: bool = False
+    serve: Flag = False
     """Serve a live stream that viewers can join."""
     serve_address: Annotated[str, arg(metavar="HOST:PORT")] = "127.0.0.1:9876"
     """Where to serve it; the default lets only this machine in."""
-    connect: Annotated[str | None, arg(metavar="URL")] = None
+    connect: Annotated[str | None, optional("URL")] = None
     """Send to a viewer that is already open, for example rerun+http://127.0.0.1:9876/proxy."""
     serve_memory: Annotated[str, arg(metavar="SIZE")] = "256MiB"
     """Memory of the served stream, for viewers that join late; then the oldest goes."""
     viewer_memory: Annotated[str, arg(metavar="SIZE")] = "2GiB"
     """Memory of the viewer window; then the oldest goes."""
-    near_mm: Annotated[int | None, arg(metavar="MM")] = None
+    near_mm: Annotated[int | None, optional("MM")] = None
     """Depth at the dark end of the colour scale; by default what suits the first frame."""
-    far_mm: Annotated[int | None, arg(metavar="MM")] = None
+    far_mm: Annotated[int | None, optional("MM")] = None
     """Depth at its bright end. Both hold for the whole run, so that colours never jump."""
-    detail: bool = False
+    detail: Flag = False
     """Show the kriging estimate, its variance and the long-edge triangles too."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import os
 import socket
@@ -351,11 +352,11 @@ class Recording:
         self._stream.disconnect()
 
     def abandon(self) -> None:
-        """Give up on a sink that died: letting go of the stream would wait for it for ever."""
-        _ABANDONED.append(self._stream)
+        """Give up on a sink that died.
 
-
-_ABANDONED: list[rr.RecordingStream] = []
+        The SDK waits for ever for such a sink when its stream is destroyed, so it never is.
+        """
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._stream))
 
 
 def never_wait_at_exit() -> None:

@@ -1,0 +1,341 @@
+"""The command: what people type, what they get wrong, and how they stop it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from selective_depth.app import cli, session
+from selective_depth.app.command import COMMANDS, SHELLS, parse
+from selective_depth.app.settings import (
+    GasOptions,
+    RunOptions,
+    Settings,
+    ViewerOptions,
+    to_toml,
+)
+
+QUICK = ("--seeds.rows", "24", "--seeds.columns", "32", "--gas.nodes", "60", "--headless")
+ENDLESS = "virtual:ball?size=160x120&frames=1000000"
+
+
+def refuse(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    """Run a command that must fail; return its code and the one line that it printed."""
+    start_s = time.monotonic()
+    code = cli.run(arguments)
+    assert time.monotonic() - start_s < 10
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1, error
+    assert error.startswith("selective-depth: ")
+    assert "Traceback" not in error
+    assert code != 0
+    return code, error
+
+
+def start(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    environment.pop("DISPLAY", None)
+    environment.pop("WAYLAND_DISPLAY", None)
+    return subprocess.Popen(
+        [sys.executable, "-m", "selective_depth.app", *arguments],
+        cwd=cwd,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def depth_rows(path: Path) -> int:
+    return sum(
+        chunk.num_rows
+        for chunk in RrdReader(str(path)).stream()
+        if chunk.entity_path == "/camera/depth"
+    )
+
+
+# Help
+
+
+def test_help_shows_examples_before_anything_else(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert text.index("Examples:") < text.index("Watch:")
+    for name in COMMANDS:
+        assert re.search(rf"^  {name} ", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_every_command_has_examples_that_parse(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = COMMANDS[name]
+    with pytest.raises(SystemExit) as ended:
+        cli.run([name, "--help"])
+    assert ended.value.code in (0, None)
+    text = capsys.readouterr().out
+    assert text.index("Examples:") < text.index(" options ")
+    assert "\x1b[" not in text  # no colours: this is no terminal
+    assert command.examples
+    for line, meaning in command.examples:
+        words = line.split()
+        assert words[:2] == ["selective-depth", name]
+        assert meaning
+        parse(command, words[2:])
+
+
+def test_help_imports_nothing_heavy() -> None:
+    probe = (
+        "import sys; from selective_depth.app import cli; cli.run(['--help']);"
+        "print([m for m in ('numpy', 'numba', 'cv2', 'rerun', 'scipy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_version_names_both(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["--version"]) == 0
+    assert re.match(r"selective-depth \d+\.\d+.*\n.*OpenNI2 runtime", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_completion_knows_the_commands(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["--completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert "replay" in script
+    assert "--gas.nodes" in script
+
+
+# Wrong usage
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["repaly", "x"], "Did you mean 'replay'?"),
+        (["xyz"], "There are: replay, live"),
+        (["--completion", "fish"], "bash, zsh"),
+        (["replay", "x", "y"], "y"),
+        (["replay", "x", "--gas.nods", "3"], "--gas.nodes"),
+        (["replay", "x", "--gas.nodes", "many"], "--gas.nodes"),
+        (["replay", "x", "--gas.algorithm", "slow"], "'exact', 'fast'"),
+        (["replay", "x", "--frames", "0"], "--frames is 0; it must be 1 or more"),
+        (["replay", "x", "--budget", "2"], "--budget is 2.0; it must be a share between 0 and 1"),
+        (["replay", "x", "--rounds", "0"], "--rounds is 0"),
+        (["replay", "x", "--near-mm", "900", "--far-mm", "800"], "--far-mm is 800"),
+        (["replay", "x", "--settings"], "--settings needs a file"),
+        (["replay", "x", "--settings", "no.toml"], "'no.toml' does not exist"),
+        (["record"], "OUT.oni"),
+        (["record", "x.oni", "--frames", "-1"], "--frames is -1"),
+    ],
+)
+def test_wrong_usage_is_one_line(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, line = refuse(capsys, *arguments)
+    assert code == 2
+    assert words in line
+
+
+def test_settings_file_with_an_unknown_key_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "s.toml").write_text("[gas]\nnodse = 3\n")
+    code, line = refuse(capsys, "replay", "x", "--settings", str(tmp_path / "s.toml"))
+    assert code == 2
+    assert "nodse" in line
+
+
+def test_settings_survive_the_round_trip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = Settings(
+        run=RunOptions(frames=7, realtime=True),
+        gas=GasOptions(nodes=500, algorithm="exact", factor=1.25),
+        viewer=ViewerOptions(save=Path('a "b" c.rrd'), near_mm=400),
+    )
+    path = tmp_path / "s.toml"
+    path.write_text(to_toml(settings, 'a "heading"\nof two lines'))
+    assert tomllib.loads(path.read_text())["gas"]["nodes"] == settings.gas.nodes
+    heard: list[Settings] = []
+    monkeypatch.setattr(session, "watch", lambda source, settings: heard.append(settings) or 0)
+    assert cli.run(["replay", "x", "--settings", str(path)]) == 0
+    assert cli.run(["replay", "x", "--settings", str(path), "--gas.nodes", "99"]) == 0
+    assert heard[0] == settings
+    assert heard[1] == dataclasses.replace(
+        settings, gas=dataclasses.replace(settings.gas, nodes=99)
+    )
+
+
+# Bad input: what people really have
+
+
+def test_missing_path(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    _, line = refuse(capsys, "replay", str(tmp_path / "none.oni"), *QUICK)
+    assert "does not exist" in line
+
+
+def test_empty_folder(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    _, line = refuse(capsys, "replay", str(tmp_path), *QUICK)
+    assert "PNG" in line
+
+
+def test_eight_bit_png(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((480, 640), 7, np.uint8))
+    _, line = refuse(capsys, "replay", str(tmp_path), *QUICK)
+    assert "16" in line
+
+
+def test_png_of_another_size(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for name, width in (("0.png", 160), ("1.png", 170)):
+        cv2.imwrite(str(tmp_path / name), np.full((120, width), 2000, np.uint16))
+    _, line = refuse(capsys, "replay", str(tmp_path), *QUICK)
+    assert "170" in line
+
+
+def test_text_named_oni(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "notes.oni").write_text("not a recording\n" * 100)
+    refuse(capsys, "replay", str(tmp_path / "notes.oni"), *QUICK)
+
+
+def test_no_runtime(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OPENNI2_REDIST", str(tmp_path))
+    for command in (["live"], ["devices"], ["record", str(tmp_path / "x.oni")]):
+        _, line = refuse(capsys, *command)
+        assert "OpenNI2 runtime" in line
+        assert str(tmp_path) in line
+
+
+@pytest.mark.parametrize("place", ["missing/out.rrd", "."])
+def test_unwritable_output(place: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    _, line = refuse(capsys, "replay", ENDLESS, *QUICK, "--save", str(tmp_path / place))
+    assert "cannot write" in line
+
+
+def test_nobody_at_the_viewers_address(capsys: pytest.CaptureFixture[str]) -> None:
+    _, line = refuse(
+        capsys, "replay", ENDLESS, *QUICK, "--connect", "rerun+http://127.0.0.1:9/proxy"
+    )
+    assert "no viewer listens" in line
+
+
+def test_selector_options_out_of_range(capsys: pytest.CaptureFixture[str]) -> None:
+    _, line = refuse(capsys, "replay", ENDLESS, *QUICK, "--gas.nodes", "-5")
+    assert "-5" in line
+
+
+def test_unexpected_error_asks_for_debug(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> int:
+        raise KeyError("surprise")
+
+    monkeypatch.setattr(cli, "invoke", fail)
+    code, line = refuse(capsys, "replay", "x")
+    assert code == 1
+    assert "KeyError" in line
+    assert "--debug" in line
+    with pytest.raises(KeyError):
+        cli.run(["replay", "x", "--debug"])
+
+
+# Whole runs
+
+
+def test_replay_ends_with_a_table(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = ENDLESS.replace("1000000", "4")
+    assert cli.run(["replay", scene, *QUICK, "--budget", "0.05"]) == 0
+    table = capsys.readouterr().out
+    for words in ("frames", "frames/s", "per frame", "mm", "p50", "neural_gas", "model RMSE"):
+        assert words in table
+    assert "\x1b[" not in table
+
+
+def test_real_sequence_is_saved_whole(shared_data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.rrd"
+    folder = shared_data / "sequence"
+    assert cli.run(["replay", str(folder), "--headless", "--frames", "12", "--save", str(out)]) == 0
+    pictures = sorted(folder.glob("*.png"))[:12]
+    found = {}
+    for chunk in RrdReader(str(out)).stream():
+        if chunk.entity_path == "/camera/depth":
+            batch = chunk.to_record_batch()
+            frames = batch.column("frame").to_pylist()
+            buffers = batch.column("DepthImage:buffer")
+            for frame, buffer in zip(frames, buffers, strict=True):
+                found[frame] = np.asarray(buffer.values.flatten()).view(np.uint16)
+    assert sorted(found) == list(range(12))
+    for frame, picture in enumerate(pictures):
+        depth_mm = cv2.imread(str(picture), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(found[frame].reshape(depth_mm.shape), depth_mm)
+
+
+def interrupt(tmp_path: Path, after_s: float | None, number: int = signal.SIGINT) -> None:
+    """Stop an endless run, at once after `after_s` or once it has saved something."""
+    out = tmp_path / "out.rrd"
+    process = start("replay", ENDLESS, *QUICK, "--save", str(out), cwd=tmp_path)
+    deadline_s = time.monotonic() + (120 if after_s is None else after_s)
+    while time.monotonic() < deadline_s and process.poll() is None:
+        if after_s is None and out.exists() and out.stat().st_size > 300_000:
+            break
+        time.sleep(0.05)
+    assert process.poll() is None, process.communicate()
+    start_s = time.monotonic()
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=30)
+    took_s = time.monotonic() - start_s
+    assert process.returncode == 130, errors
+    assert took_s < 3
+    assert "Traceback" not in errors
+    if after_s is None:
+        assert "whole loop" in output
+        assert depth_rows(out) > 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_run_ends_soon_and_keeps_its_file(tmp_path: Path, number: int) -> None:
+    interrupt(tmp_path, None, number)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(50))
+def test_interrupted_at_any_moment(tmp_path: Path, seed: int) -> None:
+    interrupt(tmp_path, random.Random(seed).uniform(0.5, 6))
+    out = tmp_path / "out.rrd"
+    if out.exists() and out.stat().st_size:
+        depth_rows(out)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no file size limit on Windows")
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_file_that_stops_growing_is_noticed_and_kept_readable(tmp_path: Path) -> None:
+    out = tmp_path / "out.rrd"
+    limited = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, -1));"
+        "from selective_depth.app.cli import run; sys.exit(run(sys.argv[1:]))"
+    )
+    scene = ENDLESS + "&live=1"
+    done = subprocess.run(
+        [sys.executable, "-c", limited, "replay", scene, *QUICK, "--save", str(out)],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert done.returncode == 1, done.stderr
+    assert "which are kept" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert 0 < depth_rows(out) < 1000
