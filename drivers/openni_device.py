@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
 import time
 from dataclasses import asdict, dataclass
@@ -125,6 +124,7 @@ class OpenNIDevice(DepthSource):
 
     live = True
     frame_count = None
+    device: DeviceInfo
 
     def __init__(self, device_uri: str = "", settings: DeviceSettings | None = None) -> None:
         self.uri = f"openni:{device_uri}" if device_uri else "openni"
@@ -134,7 +134,6 @@ class OpenNIDevice(DepthSource):
         self.misfits = 0
         self.state_reason = ""
         self._wanted_uri = device_uri
-        self.device: DeviceInfo | None = None
         self._changed = threading.Condition()
         self._closing = threading.Event()
         self._newest: tuple[DepthArray, int, int] | None = None
@@ -142,8 +141,9 @@ class OpenNIDevice(DepthSource):
         self._first_number = 0
         self._next_number: int | None = None
         self._count = _Count()
+        self._attempts = 0
         started = time.monotonic()
-        self._worker, about = self._open(_OPEN_S)
+        self._worker, about = self._open(_OPEN_S, None)
         self._reopen_s = max(_REOPEN_S, 2 * (time.monotonic() - started))
         self.camera = Camera.from_fov(
             about["width"], about["height"], about["fov_x_rad"], about["fov_y_rad"]
@@ -217,12 +217,15 @@ class OpenNIDevice(DepthSource):
         with self._changed:
             self.state, self.state_reason = state, why
 
-    def _open(self, timeout_s: float) -> tuple[Worker, Message]:
-        """Start a worker on the sensor and wait until it streams."""
+    def _open(self, timeout_s: float, known: DeviceInfo | None) -> tuple[Worker, Message]:
+        """Start a worker on the sensor and wait until it streams.
+
+        A sensor that is known may have come back under another address.
+        """
         worker = Worker(
             "device",
             uri=self._wanted_uri,
-            like=asdict(self.device) if self.device else None,
+            like=asdict(known) if known else None,
             settings=asdict(self.settings),
         )
         try:
@@ -300,6 +303,7 @@ class OpenNIDevice(DepthSource):
         if self.settings.mirror:
             depth_mm = depth_mm[:, ::-1]
         number, timestamp_us = self._count.follow(message)
+        self._attempts = 0
         with self._changed:
             self.state, self.state_reason = "live", ""
             self._newest = depth_mm, number, timestamp_us
@@ -307,12 +311,10 @@ class OpenNIDevice(DepthSource):
 
     def _reopen(self) -> None:
         """Open the sensor again, trying for as long as it takes."""
-        pauses_s = itertools.chain(_BACK_OFF_S, itertools.repeat(_BACK_OFF_S[-1]))
-        for pause_s in pauses_s:
-            if self._closing.wait(pause_s):
-                return
+        while not self._closing.wait(_BACK_OFF_S[min(self._attempts, len(_BACK_OFF_S) - 1)]):
+            self._attempts += 1
             try:
-                self._worker, _ = self._open(self._reopen_s)
+                self._worker, _ = self._open(self._reopen_s, self.device)
             except SourceNotFoundError as error:
                 self._become("lost", str(error).rstrip("."))
             except SourceError as error:

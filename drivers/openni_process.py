@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from selective_depth.drivers import source
 from selective_depth.drivers.frame import DepthArray
 from selective_depth.drivers.openni_runtime import find_runtime
 from selective_depth.drivers.openni_usb import usb_advice
@@ -29,16 +28,7 @@ Message = dict[str, Any]
 
 _SLOTS = 4
 _SLOT_BYTES = 1280 * 1024 * 2  # the largest depth image that OpenNI2 knows; unused pages cost none
-_ERRORS: dict[str, type[SourceError]] = {
-    kind.__name__: kind
-    for kind in (
-        source.SourceNotFoundError,
-        source.RuntimeMissingError,
-        source.DeviceRefusedError,
-        source.DeviceLostError,
-        source.DamagedRecordingError,
-    )
-}
+_ERRORS = {kind.__name__: kind for kind in SourceError.__subclasses__()}
 
 
 def error_of(message: Message) -> SourceError:
@@ -46,7 +36,7 @@ def error_of(message: Message) -> SourceError:
     text = str(message["message"])
     if message["on_usb"]:
         advice = usb_advice(find_runtime().drivers)
-        text += " " + (advice or "Plug it in (a Kinect: its power supply too), and try again.")
+        text += " " + (advice or "Plug it in; a Kinect needs its power supply too.")
     return _ERRORS[message["error"]](text)
 
 

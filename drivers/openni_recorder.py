@@ -13,7 +13,7 @@ from selective_depth.drivers.oni_file import inspect_oni
 from selective_depth.drivers.openni_device import DeviceSettings
 from selective_depth.drivers.openni_process import Worker, error_of
 from selective_depth.drivers.openni_replay import OpenNIRecording
-from selective_depth.drivers.source import DeviceRefusedError, SourceError, SourceNotFoundError
+from selective_depth.drivers.source import DeviceRefusedError, OutputError, SourceError
 
 _OPEN_S = 10.0  # a sensor that loads its firmware takes seconds
 _STALL_S = 5.0  # silence of the sensor after which a recording is ended
@@ -82,9 +82,9 @@ def record(
 
     Raises
     ------
-    SourceNotFoundError
-        If there is no sensor, or nothing can be written to that place.
-    RuntimeMissingError, DeviceRefusedError
+    OutputError
+        If nothing can be written to that place, or there is something already.
+    SourceNotFoundError, RuntimeMissingError, DeviceRefusedError
         As for `OpenNIDevice`.
     """
     path = Path(out_path)
@@ -122,21 +122,21 @@ def record(
 
 def _create(path: Path, unborn: Path, overwrite: bool) -> int:
     if path.suffix.lower() != ".oni":
-        raise SourceNotFoundError(f"'{path}' must end in .oni to be a recording.")
+        raise OutputError(f"'{path}' must end in .oni to be a recording.")
     if path.is_dir():
-        raise SourceNotFoundError(f"'{path}' is a folder. Give the name of a file in it.")
+        raise OutputError(f"'{path}' is a folder. Give the name of a file in it.")
     if not overwrite and path.exists() and path.stat().st_size > 0:
-        raise SourceNotFoundError(f"'{path}' exists already. Give another name, or --overwrite.")
+        raise OutputError(f"'{path}' exists already. Give another name, or --overwrite.")
     try:
         free_bytes = shutil.disk_usage(path.parent).free
         if free_bytes < 2 * _RESERVE_BYTES:
-            raise SourceNotFoundError(
+            raise OutputError(
                 f"'{path}' cannot be recorded: {free_bytes >> 20} MB are free there, and a minute"
                 " takes about 200 MB. Give another place."
             )
         return os.open(unborn, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
     except OSError as error:
-        raise SourceNotFoundError(
+        raise OutputError(
             f"'{path}' cannot be written: {error.strerror}. Give a place that can."
         ) from error
 

@@ -510,7 +510,7 @@ def wait_until_recording(file: int) -> None:
     while DATA_BEGIN not in os.pread(file, 1 << 16, 0):
         if time.monotonic() > deadline:
             raise JobError(
-                "SourceNotFoundError",
+                "OutputError",
                 "The recording cannot be written: OpenNI2 does not begin the file. Is there room"
                 " on the disk?",
             )
@@ -548,6 +548,14 @@ JOBS = {
 }
 
 
+def forbid_core_dumps() -> None:
+    """A crash here is expected; writing its memory out would delay the next start."""
+    if os.name == "posix":
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
 def watch_parent() -> None:
     """End with the parent even if a process that it forked keeps our pipe open."""
     parent = os.getppid()
@@ -565,6 +573,7 @@ def main() -> None:
     """Do the one job that the parent asks for, then leave without a farewell."""
     # Ctrl-C reaches every process of a terminal; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    forbid_core_dumps()
     parent = Parent()
     watch_parent()
     job = parent.first_job()

@@ -189,7 +189,7 @@ def test_a_slow_sensor_is_no_fault(virtual_sensor: VirtualSensor) -> None:
 
 
 def test_bursts_lose_nothing_unnoticed(virtual_sensor: VirtualSensor) -> None:
-    virtual_sensor.set(burst=10)
+    virtual_sensor.set(burst=4)
     with OpenNIDevice() as device:
         indices = [device.read().index for _ in range(8)]
         assert np.all(np.diff(indices) >= 1)
@@ -249,6 +249,15 @@ def test_another_program_holds_the_sensor(virtual_sensor: VirtualSensor) -> None
         OpenNIDevice()
     with OpenNIDevice() as device:
         device.read()
+
+
+def test_two_sensors_at_once(virtual_sensor: VirtualSensor) -> None:
+    virtual_sensor.set(devices=2)
+    with OpenNIDevice("virtual://0") as one, OpenNIDevice("virtual://1") as other:
+        for _ in range(3):
+            sensor_frame(one.read())
+            sensor_frame(other.read())
+        assert (one.device.uri, other.device.uri) == ("virtual://0", "virtual://1")
 
 
 def test_a_sensor_that_hangs_when_opened(

@@ -18,6 +18,7 @@ from selective_depth.drivers.oni_file import inspect_oni
 from selective_depth.drivers.openni import OpenNIRecording, record
 from selective_depth.drivers.source import (
     DeviceRefusedError,
+    OutputError,
     RuntimeMissingError,
     SourceError,
     SourceNotFoundError,
@@ -127,7 +128,7 @@ def test_a_file_that_cannot_grow_is_noticed(virtual_sensor: VirtualSensor, tmp_p
 def test_an_unusable_place_is_refused_at_once(tmp_path: Path, name: str, message: str) -> None:
     (tmp_path / "folder.oni").mkdir()
     (tmp_path / "there.oni").write_text("precious")
-    with pytest.raises(SourceNotFoundError, match=message):
+    with pytest.raises(OutputError, match=message):
         record(tmp_path / name)
     assert (tmp_path / "there.oni").read_text() == "precious"
 
@@ -137,7 +138,7 @@ def test_a_full_disk_is_refused_at_once_and_noticed_on_the_way(
 ) -> None:
     free_bytes = shutil.disk_usage(tmp_path).free
     monkeypatch.setattr("selective_depth.drivers.openni_recorder._RESERVE_BYTES", 2 * free_bytes)
-    with pytest.raises(SourceNotFoundError, match="MB are free"):
+    with pytest.raises(OutputError, match="MB are free"):
         record(tmp_path / "out.oni")
     assert not list(tmp_path.glob("out*"))
     plenty = shutil.disk_usage(tmp_path)._replace(free=9 * free_bytes)

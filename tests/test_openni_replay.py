@@ -181,7 +181,7 @@ def test_two_hundred_cycles_of_open_read_three_close(oni_sample: OniSample) -> N
 
 
 def test_cycles_of_open_read_three_close_leave_nothing(oni_sample: OniSample) -> None:
-    cycle(oni_sample, 12)
+    cycle(oni_sample, 8)
 
 
 def cycle(sample: OniSample, times: int) -> None:
