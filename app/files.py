@@ -12,8 +12,9 @@ from selective_depth.app.errors import UsageError
 from selective_depth.app.progress import FrameProgress, waiting
 from selective_depth.app.report import say
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.oni_file import OniReport, inspect_oni
-from selective_depth.drivers.oni_reader import export_oni, repair_oni
+from selective_depth.drivers.oni_file import inspect_oni
+from selective_depth.drivers.oni_report import OniReport
+from selective_depth.drivers.oni_rescue import export_oni, repair_oni
 from selective_depth.drivers.oni_writer import OniWriter
 from selective_depth.drivers.recorded import FolderWriter
 from selective_depth.drivers.source import DepthSource, open_source

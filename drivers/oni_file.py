@@ -9,12 +9,9 @@ from __future__ import annotations
 
 import errno
 import os
-import stat
-import struct
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -42,155 +39,21 @@ from selective_depth.drivers.oni_records import (
     parse_property,
     read_record,
 )
+from selective_depth.drivers.oni_report import (
+    STREAMS,
+    OniFrame,
+    OniNode,
+    OniProblem,
+    OniReport,
+)
 from selective_depth.drivers.source import DamagedRecordingError, SourceNotFoundError
 
-_STREAMS: Final = frozenset((NodeType.DEPTH, NodeType.IMAGE, NodeType.IR))
 CODECS: Final = frozenset((*DEPTH_CODECS, b"JPEG", b"Im8z"))
 _MAX_NODES: Final = 64
 _MILLIMETRES: Final = 100
 """OpenNI2's number of the pixel format "depth in millimetres"."""
 _SIZES: Final = {"xnMapOutputMode": 12, "xnCropping": 12, "xnFOV": 16}
 _SCAN_BYTES: Final = 1 << 20
-
-
-@dataclass(frozen=True, slots=True)
-class OniProblem:
-    """Something wrong in a file.
-
-    Parameters
-    ----------
-    offset : int
-        Where, in bytes from the beginning.
-    sentence : str
-        What.
-    harmless : bool
-        True if OpenNI2 replays the file all the same, as far as it goes.
-    """
-
-    offset: int
-    sentence: str
-    harmless: bool = False
-
-    def __str__(self) -> str:
-        return f"byte {self.offset}: {self.sentence}"
-
-
-@dataclass(frozen=True, slots=True)
-class OniFrame:
-    """One frame of a node: its place in the file, its number (from 1) and its time."""
-
-    number: int
-    timestamp_us: int
-    record_offset: int
-    payload_offset: int
-    payload_size: int
-
-
-@dataclass
-class OniNode:
-    """One stream (or the device) of a recording."""
-
-    number: int
-    name: str
-    node_type: int
-    codec: bytes
-    declared_frames: int | None
-    seek_table_offset: int
-    offset: int
-    properties: dict[str, tuple[Kind, bytes]] = field(default_factory=dict)
-    frames: list[OniFrame] = field(default_factory=list)
-    ready: bool = False
-    removed: bool = False
-    has_seek_table: bool = False
-
-    @property
-    def is_stream(self) -> bool:
-        """True if the node delivers frames."""
-        return self.node_type in _STREAMS
-
-    def number_of(self, name: str) -> int | None:
-        """Value of a whole-number property, None if it is not there."""
-        kind, value = self.properties.get(name, (None, b""))
-        return int.from_bytes(value, "little") if kind is Kind.INT_PROPERTY else None
-
-    def values_of(self, name: str, form: str) -> tuple[float, ...] | None:
-        """Values of a structured property, None if it is not there or has another size."""
-        value = self.properties.get(name, (None, b""))[1]
-        return struct.unpack(form, value) if len(value) == struct.calcsize(form) else None
-
-
-@dataclass(frozen=True)
-class OniReport:
-    """What an .oni file holds and what is wrong with it.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    size_bytes : int
-        Its length.
-    version : str
-        Version of the format, as "1.0.1.0"; empty if the header is broken.
-    nodes : tuple of OniNode
-        Everything that was recorded, in the file's order.
-    depth : OniNode or None
-        The depth stream; its `frames` are the readable ones.
-    camera : Camera or None
-        Intrinsics from the recorded field of view (a Kinect's where there is none); None if the
-        frame size is unknown.
-    fps : float
-        Recorded frame rate.
-    problems : tuple of OniProblem
-        By offset; empty if nothing is wrong.
-    ended : bool
-        True if the recorder closed the file.
-    tail_bytes : int
-        Bytes after the end, which OpenNI2's recorder leaves as zeros.
-    old : bool
-        True for versions before 1.0.1.0.
-    decoded_frames : int
-        Number of depth frames that were also decoded, not only found.
-    swapped_frames : int
-        Number of these in which OpenNI2's recorder swapped the last pixels, so that its player
-        shows up to 29 wrong ones (see `oni_codec`). They are read rightly here.
-    """
-
-    path: Path
-    size_bytes: int
-    version: str
-    nodes: tuple[OniNode, ...]
-    depth: OniNode | None
-    camera: Camera | None
-    fps: float
-    problems: tuple[OniProblem, ...]
-    ended: bool
-    tail_bytes: int
-    old: bool
-    decoded_frames: int
-    swapped_frames: int
-
-    @property
-    def readable_frames(self) -> int:
-        """Number of depth frames that are all there."""
-        return len(self.depth.frames) if self.depth is not None else 0
-
-    @property
-    def complete(self) -> bool:
-        """True if nothing is wrong with the file."""
-        return self.ended and not self.problems and self.readable_frames > 0
-
-    @property
-    def openable(self) -> bool:
-        """True if OpenNI2's player can be given the file: it delivers `readable_frames`."""
-        return self.readable_frames > 0 and all(problem.harmless for problem in self.problems)
-
-    @property
-    def duration_s(self) -> float:
-        """Seconds from the first to the last readable depth frame."""
-        if self.depth is None or not self.depth.frames:
-            return 0.0
-        frames = self.depth.frames
-        return (frames[-1].timestamp_us - frames[0].timestamp_us) / 1e6
 
 
 def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10.0) -> OniReport:
@@ -214,30 +77,46 @@ def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10
         read.
     """
     path = Path(path)
+    with open_regular(path) as file:
+        try:
+            return _Inspection(path, file, timeout_s).report(decode)
+        except OSError as error:
+            raise _unreadable(path, error) from error
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading, unbuffered, unless reading it could take for ever.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If there is no such file, it is no regular file (a folder, a pipe, a device) or cannot be
+        opened.
+    """
     try:
-        status = path.stat()
-        # Opening a pipe would wait for ever.
-        if not stat.S_ISREG(status.st_mode):
+        if not path.exists():
+            raise SourceNotFoundError(f"'{path}' does not exist; check its name.")
+        if not path.is_file():
             what = "a folder" if path.is_dir() else "no regular file"
             raise SourceNotFoundError(f"'{path}' is {what}; give a recording, FILE.oni.")
-        with path.open("rb", buffering=0) as file:
-            return _Inspection(path, file, status.st_size, timeout_s).report(decode)
-    except FileNotFoundError:
-        raise SourceNotFoundError(f"'{path}' does not exist; check its name.") from None
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        reason = getattr(error, "strerror", None) or error
-        raise SourceNotFoundError(
-            f"'{path}' cannot be read ({reason}); check its name and its permissions."
-        ) from error
+        return path.open("rb", buffering=0)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: OSError) -> SourceNotFoundError:
+    return SourceNotFoundError(
+        f"'{path}' cannot be read ({error.strerror}); check its name and its permissions."
+    )
 
 
 class _Inspection:
     """One walk over a file."""
 
-    def __init__(self, path: Path, file: BinaryIO, size: int, timeout_s: float) -> None:
+    def __init__(self, path: Path, file: BinaryIO, timeout_s: float) -> None:
         self.path = path
         self.file = file
-        self.size = size
+        self.size = os.fstat(file.fileno()).st_size
         self.deadline = time.monotonic() + timeout_s
         self.problems: list[OniProblem] = []
         self.nodes: dict[int, OniNode] = {}
@@ -406,7 +285,7 @@ class _Inspection:
                 f"node {record.node} is beyond the highest that the header states,"
                 f" {self.highest_node}"
             )
-        if addition.node_type in _STREAMS and addition.codec not in CODECS:
+        if addition.node_type in STREAMS and addition.codec not in CODECS:
             raise RecordError(f"the compression {addition.codec!r} is not known")
 
     def _begin(self, node: OniNode, record: Record) -> None:
@@ -457,6 +336,8 @@ class _Inspection:
         node.has_seek_table = True
         self.file.seek(record.payload_offset)
         table = self.file.read(record.payload_size)
+        if len(table) != record.payload_size:
+            raise RecordError("the file became shorter while it was read")
         for frame, entry in zip(node.frames, list(form.iter_unpack(table))[1:], strict=True):
             if (entry[0], entry[2]) != (frame.timestamp_us, frame.record_offset):
                 self._problem(

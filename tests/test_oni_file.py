@@ -19,8 +19,8 @@ from virtual_sensor import record_oni
 
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.oni_codec import CODEC_NONE, CODEC_TABLE, encode_depth
-from selective_depth.drivers.oni_file import OniReport, inspect_oni
-from selective_depth.drivers.oni_reader import OniReader, export_oni, mend_oni, repair_oni
+from selective_depth.drivers.oni_file import inspect_oni
+from selective_depth.drivers.oni_reader import OniReader
 from selective_depth.drivers.oni_records import (
     BEGIN_FIELDS,
     FILE_HEADER,
@@ -33,6 +33,8 @@ from selective_depth.drivers.oni_records import (
     NodeType,
     pack_property,
 )
+from selective_depth.drivers.oni_report import OniReport
+from selective_depth.drivers.oni_rescue import export_oni, mend_oni, repair_oni
 from selective_depth.drivers.oni_writer import (
     OniWriter,
     RecordWriter,
@@ -548,7 +550,7 @@ def test_what_is_no_file_is_said_at_once(tmp_path: Path) -> None:
             asking(tmp_path / "none.oni")
     with pytest.raises(SourceNotFoundError, match="is a folder"):
         inspect_oni(tmp_path)
-    with pytest.raises(SourceNotFoundError, match="cannot be read"):
+    with pytest.raises(SourceNotFoundError, match="does not exist"):
         inspect_oni(tmp_path / "a\0b.oni")
     with pytest.raises(SourceNotFoundError, match="cannot be read"):
         inspect_oni(tmp_path / ("x" * 5000))

@@ -20,7 +20,8 @@ from raw_oni_player import Outcome, digest_of, play_all
 
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni_file import inspect_oni
-from selective_depth.drivers.oni_reader import OniReader, repair_oni
+from selective_depth.drivers.oni_reader import OniReader
+from selective_depth.drivers.oni_rescue import repair_oni
 from selective_depth.drivers.openni_runtime import find_runtime
 from selective_depth.drivers.source import (
     DamagedRecordingError,
