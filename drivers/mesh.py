@@ -21,6 +21,7 @@ So that depth in whole millimetres is fine enough for any object (one part in 1,
 object stands about 2 m away, as the scenes of the paper do.
 """
 
+_SMALLEST = 1e-100  # extent of an object; below, it is one point
 _MARGIN = 0.02  # share of the frame left free on each side
 _NEAREST_MM = 100.0  # no part of the object comes closer to the camera than this
 _FARTHEST_MM = 65535  # what a uint16 can hold
@@ -128,7 +129,7 @@ def place(
     low, high = points.min(axis=0), points.max(axis=0)
     extent = float((high - low).max())
     # Centred before it is scaled: a file far from its own origin must not lose its digits.
-    points = (points - (low + high) / 2) * (OBJECT_MM / extent if extent > 0 else 1.0)
+    points = (points - (low + high) / 2) * (OBJECT_MM / extent if extent > _SMALLEST else 1.0)
     half_x = (1 - 2 * _MARGIN) * camera.width / (2 * camera.fx)
     half_y = (1 - 2 * _MARGIN) * camera.height / (2 * camera.fy)
     reach = np.maximum(np.abs(points[:, 0]) / half_x, np.abs(points[:, 1]) / half_y)

@@ -18,6 +18,7 @@ _SCALARS = {
 }  # fmt: skip
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 64 * 1024
+_LARGEST = 1e100  # of a coordinate: differences and squares still have room
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 
 
@@ -309,8 +310,8 @@ def _mesh(columns: _Columns) -> Mesh:
             raise _BadPlyError(f"it has no vertices with a plain property '{axis}'")
         axes.append(column.astype(np.float64))
     points = np.stack(axes, axis=1)
-    if not np.isfinite(points).all():
-        raise _BadPlyError("some of its coordinates are not finite numbers")
+    if not (np.abs(points) < _LARGEST).all():  # NaN fails as well
+        raise _BadPlyError(f"some of its coordinates are not finite, or beyond {_LARGEST:g}")
     faces = next((columns[key] for name in _FACE_LISTS if (key := ("face", name)) in columns), None)
     if not isinstance(faces, _Lists):
         return Mesh(points, np.zeros((0, 3), np.int32))

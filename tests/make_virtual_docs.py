@@ -18,7 +18,7 @@ from selective_depth.drivers.virtual_scenes import SCENES
 
 ROOT = Path(__file__).parent.parent
 PICTURE = ROOT / "app" / "docs" / "pictures" / "virtual-kinect.png"
-WIDTH = 264
+WIDTH = 248
 
 
 def panel(uri: str, caption: str) -> npt.NDArray[np.uint8]:

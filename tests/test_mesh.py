@@ -142,6 +142,7 @@ HEADER = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty fl
         (HEADER + "end_header\n1 2\n", "property 'z'"),
         (HEADER + "property float z\nend_header\n1 2\n", "1 numbers are missing"),
         (HEADER + "property float z\nend_header\n1 2 nan\n", "not finite"),
+        (HEADER + "property float z\nend_header\n1 2 1e300\n", "beyond 1e"),
         (HEADER + "property float z\nend_header\n1 2 three\n", "something else than numbers"),
         (HEADER + "property string z\nend_header\n1 2 3\n", "property string z"),
         (HEADER.replace("1\np", "99999999999\np") + "end_header\n1 2\n", "are missing"),
@@ -257,8 +258,9 @@ def test_points_without_faces_make_a_closed_surface(file):
     assert 0.02 < (thin > 0).mean() < 0.1  # dots of 3 x 3 pixels, 15 apart
 
 
-def test_one_point_is_seen(file):
-    file.write_bytes(ply_bytes([(5, 5, 5)]))
+@pytest.mark.parametrize("points", [[(5, 5, 5)], [(0, 0, 0), (1e-310, 0, 0)], [(2, 2, 2)] * 9])
+def test_one_point_is_seen(file, points):
+    file.write_bytes(ply_bytes(points))
     assert MeshSource(str(file)).read().depth_mm.any()
 
 

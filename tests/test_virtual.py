@@ -119,13 +119,12 @@ def random_turn(seed: int) -> npt.NDArray[np.float64]:
 
 
 def agree(fast: npt.NDArray[np.float32], slow: npt.NDArray[np.float64], close_mm: float) -> None:
-    """Equal depth; only pixels on an outline, where rounding decides, may differ."""
+    """Equal depth; on an outline rounding decides what is seen, and rays graze the surface."""
     fast_mm = np.where(fast > 0, 1.0 / np.maximum(fast, 1e-12), 0.0)
-    differs = np.abs(fast_mm - slow) > close_mm + 1e-6 * slow
-    blurred = cv2.dilate(slow, np.ones((3, 3))) - cv2.erode(slow, np.ones((3, 3)))
-    on_outline = blurred > 20 * close_mm
-    assert not (differs & ~on_outline).any()
-    assert (differs & on_outline).sum() <= max(1, 0.03 * on_outline.sum())
+    apart = np.abs(fast_mm - slow) - 1e-6 * slow
+    on_outline = cv2.dilate(slow, np.ones((3, 3))) - cv2.erode(slow, np.ones((3, 3))) > 1
+    assert (apart[~on_outline] <= close_mm).all()
+    assert (apart[on_outline] > 0.5).sum() <= max(1, 0.03 * on_outline.sum())
 
 
 @pytest.mark.parametrize("kind", [QUAD, SPHERE, CYLINDER, DISC, TORUS])
