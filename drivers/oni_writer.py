@@ -116,6 +116,12 @@ class RecordWriter:
             finally:
                 self._file.close()
 
+    def discard(self) -> None:
+        """Close and remove the file."""
+        if not self._file.closed:
+            self._file.close()
+            self.path.unlink(missing_ok=True)
+
     def _finish(self) -> None:
         additions = []
         for number, node in self._nodes.items():
@@ -218,7 +224,9 @@ class OniWriter:
         self._writer.add_frame(1, since_us, encode_depth(frame.depth_mm))
 
     def close(self) -> None:
-        """Finish the file."""
+        """Finish the file; without a frame there is none."""
+        if self._camera is None:
+            self._writer.discard()
         self._writer.close()
 
     def __enter__(self) -> Self:

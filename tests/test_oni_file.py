@@ -257,6 +257,11 @@ def test_a_failing_source_leaves_a_complete_file(tmp_path: Path) -> None:
     assert len(_read(tmp_path / "out.oni")) == 3
 
 
+def test_without_a_frame_there_is_no_file(tmp_path: Path) -> None:
+    assert write_oni(tmp_path / "out.oni", []) == 0
+    assert not (tmp_path / "out.oni").exists()
+
+
 def test_a_full_disk_is_said() -> None:
     full = Path("/dev/full")
     if not full.exists():
