@@ -6,9 +6,9 @@ import threading
 import time
 from dataclasses import asdict, dataclass
 
-from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
+from selective_depth.drivers.frame import DepthArray, DepthFrame
 from selective_depth.drivers.openni_list import DeviceInfo
-from selective_depth.drivers.openni_process import Message, Worker, error_of
+from selective_depth.drivers.openni_process import Message, Worker, camera_of, error_of
 from selective_depth.drivers.source import (
     DepthSource,
     DeviceLostError,
@@ -145,9 +145,7 @@ class OpenNIDevice(DepthSource):
         started = time.monotonic()
         self._worker, about = self._open(_OPEN_S, None)
         self._reopen_s = max(_REOPEN_S, 2 * (time.monotonic() - started))
-        self.camera = Camera.from_fov(
-            about["width"], about["height"], about["fov_x_rad"], about["fov_y_rad"]
-        )
+        self.camera = camera_of(about)
         self.fps = float(about["fps"])
         self._supervisor = threading.Thread(
             target=self._supervise, name="openni-supervisor", daemon=True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import mmap
 import os
 import queue
@@ -18,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from selective_depth.drivers.frame import DepthArray
+from selective_depth.drivers.frame import Camera, DepthArray
 from selective_depth.drivers.openni_runtime import find_runtime
 from selective_depth.drivers.openni_usb import usb_advice
 from selective_depth.drivers.source import SourceError
@@ -34,10 +35,18 @@ _ERRORS = {kind.__name__: kind for kind in SourceError.__subclasses__()}
 def error_of(message: Message) -> SourceError:
     """The named error that an ``error`` message stands for."""
     text = str(message["message"])
-    if message["on_usb"]:
-        advice = usb_advice(find_runtime().drivers)
-        text += " " + (advice or "Plug it in; a Kinect needs its power supply too.")
+    if message["remedy"]:
+        text += " " + (usb_advice(find_runtime().drivers) or message["remedy"])
     return _ERRORS[message["error"]](text)
+
+
+def camera_of(stream: Message) -> Camera:
+    """Intrinsics of a stream from its fields of view; a Kinect's where it does not know them."""
+    size = int(stream["width"]), int(stream["height"])
+    fov_rad = float(stream["fov_x_rad"]), float(stream["fov_y_rad"])
+    if all(0 < angle < math.pi for angle in fov_rad):
+        return Camera.from_fov(*size, *fov_rad)
+    return Camera.kinect(*size)
 
 
 class Worker:

@@ -6,9 +6,9 @@ import time
 from pathlib import Path
 from typing import TypeVar
 
-from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni_file import inspect_oni
-from selective_depth.drivers.openni_process import Message, Worker, error_of
+from selective_depth.drivers.openni_process import Message, Worker, camera_of, error_of
 from selective_depth.drivers.source import (
     DamagedRecordingError,
     DepthSource,
@@ -56,9 +56,7 @@ class OpenNIRecording(DepthSource):
             about = self._receive(_OPEN_S)
             if about is None:
                 raise DamagedRecordingError(f"'{self.uri}' cannot be opened: OpenNI2 hangs on it.")
-            self.camera = Camera.from_fov(
-                about["width"], about["height"], about["fov_x_rad"], about["fov_y_rad"]
-            )
+            self.camera = camera_of(about)
         except BaseException:
             self.close()
             raise

@@ -35,13 +35,13 @@ NO_GROWTH_S = 1.5  # a frame takes some 100 kB: a file that stops growing is not
 class JobError(Exception):
     """Ends the job; `kind` is the name of the error that the parent raises.
 
-    With `on_usb`, what the USB bus says of the sensor would help.
+    A `remedy` is what to do unless the USB bus, where the parent looks, tells more.
     """
 
-    def __init__(self, kind: str, message: str, on_usb: bool = False) -> None:
+    def __init__(self, kind: str, message: str, remedy: str = "") -> None:
         super().__init__(message)
         self.kind = kind
-        self.on_usb = on_usb
+        self.remedy = remedy
 
 
 class Device(openni2.Device):  # type: ignore[misc]
@@ -191,12 +191,16 @@ def choose(found: list[dict[str, Any]], wanted: str, like: dict[str, Any] | None
             f"There is no sensor '{wanted}'. Connected: {uris}.",
         )
     if not found:
-        raise JobError("SourceNotFoundError", "OpenNI2 finds no depth sensor.", on_usb=True)
+        raise JobError(
+            "SourceNotFoundError",
+            "OpenNI2 finds no depth sensor.",
+            "Plug one in; a Kinect needs its power supply too.",
+        )
     if len(found) > 1:
         raise JobError(
             "SourceNotFoundError",
-            f"{len(found)} sensors are connected: {uris}. Name the one to use, for example"
-            f" openni:{found[0]['uri']}.",
+            f"{len(found)} sensors are connected: {uris}. Name one of them, as in"
+            f" `selective-depth live {found[0]['uri']}`.",
         )
     return found[0]
 
@@ -234,9 +238,8 @@ class LiveStream:
         except OpenNIError as error:
             raise JobError(
                 "DeviceRefusedError",
-                f"The sensor {uri} is there but cannot be opened: {reason(error)}. Another program"
-                " may hold it.",
-                on_usb=True,
+                f"The sensor {uri} is there but cannot be opened: {reason(error)}.",
+                "Close the program that uses it, or pull it out and plug it in again.",
             ) from error
         if not self.device.has_sensor(openni2.SENSOR_DEPTH):
             raise JobError("DeviceRefusedError", f"The sensor {uri} has no depth camera.")
@@ -309,12 +312,16 @@ class LiveStream:
 def describe(stream: Any) -> dict[str, Any]:
     """What the parent needs to know of a depth stream."""
     mode = stream.get_video_mode()
+    try:
+        fov_rad = stream.get_horizontal_fov(), stream.get_vertical_fov()
+    except OpenNIError:
+        fov_rad = (0.0, 0.0)  # not every driver knows it
     return {
         "width": mode.resolutionX,
         "height": mode.resolutionY,
         "fps": mode.fps,
-        "fov_x_rad": stream.get_horizontal_fov(),
-        "fov_y_rad": stream.get_vertical_fov(),
+        "fov_x_rad": fov_rad[0],
+        "fov_y_rad": fov_rad[1],
     }
 
 
@@ -580,12 +587,12 @@ def main() -> None:
     try:
         JOBS[job["job"]](job, parent)
     except JobError as error:
-        parent.send("error", error=error.kind, message=str(error), on_usb=error.on_usb)
+        parent.send("error", error=error.kind, message=str(error), remedy=error.remedy)
     except BrokenPipeError:
         pass  # The parent is gone: there is nobody left to tell.
     except Exception as error:  # noqa: BLE001 - the parent turns it into a named error
         kind = "DamagedRecordingError" if job["job"] == "recording" else "DeviceLostError"
-        parent.send("error", error=kind, message=f"OpenNI2 failed: {reason(error)}.", on_usb=False)
+        parent.send("error", error=kind, message=f"OpenNI2 failed: {reason(error)}.", remedy="")
     # What is needed is closed. The library's own clean-up at exit can crash or hang.
     os._exit(0)
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from virtual_sensor import VirtualSensor
 
-from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.openni import (
     DeviceInfo,
     DeviceSettings,
@@ -109,6 +109,12 @@ def test_camera_comes_from_the_field_of_view(virtual_sensor: VirtualSensor) -> N
         camera = device.camera
         assert (camera.width, camera.height, device.fps) == (640, 480, 30)
         assert (camera.fx, camera.fy) == pytest.approx((585, 585), abs=1)
+
+
+def test_a_sensor_that_does_not_know_its_field_of_view(virtual_sensor: VirtualSensor) -> None:
+    virtual_sensor.set(no_fov=1)
+    with OpenNIDevice() as device:
+        assert device.camera == Camera.kinect()
 
 
 def test_mirrored_where_asked(virtual_sensor: VirtualSensor) -> None:
@@ -224,7 +230,7 @@ def test_it_comes_back_under_another_address(virtual_sensor: VirtualSensor) -> N
     ("fault", "error", "message"),
     [
         ({"connected": 0}, SourceNotFoundError, r"finds no depth sensor.*power supply"),
-        ({"devices": 2}, SourceNotFoundError, r"2 sensors .*virtual://0, virtual://1.* openni:v"),
+        ({"devices": 2}, SourceNotFoundError, r"2 sensors .*0, virtual://1.* live virtual://0"),
         ({"refuse_open": 1}, DeviceRefusedError, "told to refuse"),
         ({"refuse_stream": 1}, DeviceRefusedError, "refuses a depth stream"),
         ({"refuse_start": 1}, DeviceRefusedError, "does not start"),
@@ -244,8 +250,13 @@ def test_there_is_no_sensor_of_that_name(virtual_sensor: VirtualSensor) -> None:
         open_source("openni:virtual://7")
 
 
+def test_what_it_cannot_do_is_refused(virtual_sensor: VirtualSensor) -> None:
+    with pytest.raises(DeviceRefusedError, match="cannot register"):
+        OpenNIDevice(settings=DeviceSettings(registration=True))
+
+
 def test_another_program_holds_the_sensor(virtual_sensor: VirtualSensor) -> None:
-    with OpenNIDevice(), pytest.raises(DeviceRefusedError, match=r"busy.*Another program"):
+    with OpenNIDevice(), pytest.raises(DeviceRefusedError, match=r"busy.*Close the program"):
         OpenNIDevice()
     with OpenNIDevice() as device:
         device.read()

@@ -15,6 +15,7 @@ burst              1         frames made back to back, then a pause: the same ra
 limit              -1        stop after this many frames of a stream (a stall); -1: never
 stall              0         1: no frames, and no error either
 odd                0         1: frames of half the height
+no_fov             0         1: it does not know its field of view
 refuse_open,       0         1: that call fails
 refuse_stream,
 refuse_start

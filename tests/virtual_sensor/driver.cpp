@@ -126,6 +126,8 @@ public:
     }
 
     OniStatus getProperty(int id, void* data, int* size) override {
+        const bool fov = id == ONI_STREAM_PROPERTY_HORIZONTAL_FOV || id == ONI_STREAM_PROPERTY_VERTICAL_FOV;
+        if (fov && control().on("no_fov")) return ONI_STATUS_NOT_SUPPORTED;
         switch (id) {
         case ONI_STREAM_PROPERTY_CROPPING: return answer(OniCropping{}, data, size);
         case ONI_STREAM_PROPERTY_HORIZONTAL_FOV: return answer(float(kFovX), data, size);
