@@ -47,6 +47,8 @@ class Handover(Generic[T]):
     ----------
     dropped : int
         Items that never reached the sink.
+    ready : threading.Event
+        Set once the sink is open, or has failed to.
     failure : Exception or None
         What ended the sink before its time; nothing is taken any more.
     """
@@ -63,6 +65,7 @@ class Handover(Generic[T]):
         self.name = name
         self.dropped = 0
         self.failure: Exception | None = None
+        self.ready = threading.Event()
         self._sink = sink
         self._lossless = lossless
         self._patience_s = patience_s
@@ -118,6 +121,7 @@ class Handover(Generic[T]):
     def _serve(self) -> None:
         try:
             self._sink.open()
+            self.ready.set()
             while (item := self._next()) is not None:
                 self._sink.put(item)
             self._sink.close()
@@ -127,6 +131,7 @@ class Handover(Generic[T]):
                 self.dropped += len(self._queue)
                 self._queue.clear()
                 self._changed.notify_all()
+            self.ready.set()
 
     def _next(self) -> T | None:
         with self._changed:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -74,6 +76,7 @@ def depth_limits_mm(depth_mm: npt.NDArray[np.uint16]) -> tuple[int, int]:
     return near, max(int(-(-high // 500)) * 500, near + 500)
 
 
+@cache
 def palette(colormap: int, count: int = 256) -> npt.NDArray[np.uint32]:
     """Colours of an OpenCV colour map, packed as 0xRRGGBBAA."""
     levels = np.linspace(0, 255, count).astype(np.uint8).reshape(-1, 1)
@@ -137,6 +140,7 @@ def _write(image: npt.NDArray[np.uint8], text: str, left: int, base: int) -> int
     return int(end)
 
 
+@cache
 def round_colours(rounds: int) -> npt.NDArray[np.uint32]:
     """One colour per round, dark to bright; round 0, the seeds, is grey."""
     ramp = palette(cv2.COLORMAP_PLASMA)[np.linspace(70, 240, max(rounds, 1)).astype(int)]

@@ -37,7 +37,7 @@ class Loop:
     """
 
     def __init__(self, settings: Settings, *, every_model: bool = True) -> None:
-        gas, improvement = settings.gas, settings.improvement
+        gas, improvement, threads = settings.gas, settings.improvement, settings.run.threads
         self.times = StageTimes()
         self._settings = settings
         self._live_gas = gas.training == "live"
@@ -48,8 +48,11 @@ class Loop:
             seed=gas.seed,
             edge_metric=gas.edge_metric,
             factor=gas.factor,
+            threads=threads,
         )
-        self._improvement = ImprovementSelector(share=improvement.share)
+        self._improvement = ImprovementSelector(
+            share=improvement.share, exponent=improvement.exponent, threads=threads
+        )
         self._every_model = every_model
         # The selectors are compiled and free of the GIL: side by side they take as long as
         # the longer of them.
@@ -92,7 +95,13 @@ class Loop:
         if options.budget == 0:
             return None
         with self.times.stage("acquire"):
-            return acquire(frame.measure, seeds, options.budget, rounds=options.rounds)
+            return acquire(
+                frame.measure,
+                seeds,
+                options.budget,
+                rounds=options.rounds,
+                threads=self._settings.run.threads,
+            )
 
     def _model(self, frame: DepthFrame, acquisition: Acquisition | None) -> Model | None:
         if acquisition is None:

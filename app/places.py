@@ -24,6 +24,8 @@ PROBE_S = 0.3
 and lose what is logged."""
 WINDOW_S = 10.0
 """How long a window may take to open."""
+READY_S = 5.0
+"""How long a place may take to open before the run begins without it."""
 CHECK_EVERY_S = 1.0
 STALL_S = 0.5
 """A viewer that takes longer over a step has stalled; a recording waits no more."""
@@ -154,6 +156,7 @@ class ServedPlace(Place):
     def __init__(self, options: ViewerOptions, times: StageTimes) -> None:
         super().__init__(f"stream served on {options.serve_address}", options, times)
         self.host, self.port = _host_and_port(options.serve_address)
+        self.url = f"rerun+http://{options.serve_address}/proxy"
         try:
             with socket.create_server((self.host, self.port)):
                 pass
@@ -294,6 +297,17 @@ class Viewer:
                     capacity=FILE_QUEUE if file else 2,
                 )
             )
+
+    @property
+    def served_url(self) -> str:
+        """Address at which viewers join; empty if nothing is served."""
+        served = [place.url for place in self._places if isinstance(place, ServedPlace)]
+        return served[0] if served else ""
+
+    def wait_ready(self) -> None:
+        """Wait until every place is open, though for none that stalls."""
+        for way in self._ways:
+            way.ready.wait(READY_S)
 
     def show(self, item: Step | StateNote) -> None:
         """Hand a step, or the sensor's state without one, to every place.

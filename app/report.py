@@ -99,7 +99,7 @@ def print_report(report: RunReport) -> None:
     table.add_row("frames", f"{report.frames:,}", "")
     table.add_row("whole loop", f"{report.fps:.1f}", "frames/s")
     if report.live:
-        table.add_row("dropped by the sensor side", f"{report.dropped:,}", "frames")
+        table.add_row("skipped to keep up", f"{report.dropped:,}", "frames")
         table.add_row("sensor at the end", report.state, "")
     for name, missed in report.missed.items():
         table.add_row(f"not shown in {name}", f"{missed:,}", "frames")

@@ -68,8 +68,7 @@ def record_sensor(
             progress=progress.update,
             overwrite=overwrite,
         )
-    rate = report.frames / report.seconds if report.seconds else 0.0
-    say(f"wrote {out}: {report.frames} frames, {report.seconds:.1f} s, {rate:.1f} frames/s")
+    say(f"wrote {out}: {report.frames} frames, read back; it took {report.seconds:.1f} s")
     if report.problem:
         say(f"note: {report.problem}")
     if report.ended == "interrupted":

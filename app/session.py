@@ -71,6 +71,7 @@ def check(settings: Settings) -> None:
     far_mm = 65535 if seen.far_mm is None else seen.far_mm
     for option, value, allowed, good in (
         ("--frames", run.frames, "1 or more", run.frames is None or run.frames >= 1),
+        ("--threads", run.threads, "1 or more", run.threads is None or run.threads >= 1),
         ("--budget", spend.budget, "a share between 0 and 1", 0 <= spend.budget <= 1),
         ("--rounds", spend.rounds, "between 1 and 255", 1 <= spend.rounds <= 255),
         ("--near-mm", seen.near_mm, "0 or more", (seen.near_mm or 0) >= 0),
@@ -135,8 +136,13 @@ class Session:
             self.settings = dataclasses.replace(self.settings, viewer=seen)
             loop = stack.enter_context(Loop(self.settings, every_model=not source.live))
             viewer = Viewer(seen, live=source.live, times=loop.times)
+            if seen.serve:
+                say(f"Serving on {seen.serve_address}; join with 'rerun {viewer.served_url}'.")
             try:
                 self._turn_all(source, loop, viewer)
+                if seen.serve and not report.live:
+                    say("All frames are served; Ctrl-C ends.")
+                    threading.Event().wait()
             except KeyboardInterrupt:
                 _leave_soon()
                 code = INTERRUPTED
@@ -162,6 +168,7 @@ class Session:
                 if self.report.frames == 0:
                     with waiting("Compiling for this machine; the next run starts at once"):
                         loop.warm_up(frame)
+                        viewer.wait_ready()
                     start_s = recent[0] = time.monotonic()
                 step = loop.turn(frame, _state(source))
                 recent.append(time.monotonic())

@@ -54,6 +54,8 @@ class ImprovementOptions:
 
     share: float = 0.10
     """Share of the known pixels that the mask selects, 0..1."""
+    exponent: float = 1.4
+    """Exponent w = 2 - epsilon of the semivariogram, eq. (24); between 0 and 2."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,8 @@ class RunOptions:
 
     frames: Annotated[int | None, optional("N")] = None
     """Stop after this many frames; by default at the end of the recording, or with Ctrl-C."""
+    threads: Annotated[int | None, optional("N")] = None
+    """Threads of the compiled kernels; by default one per processor."""
     realtime: Flag = False
     """Replay at the recorded rate, the newest frame first, as a sensor would deliver."""
 
@@ -85,7 +89,7 @@ class ViewerOptions:
     save: Annotated[Path | None, optional("FILE")] = None
     """Write everything to a Rerun recording (.rrd), and the settings beside it."""
     serve: Flag = False
-    """Serve a live stream that viewers can join."""
+    """Serve a stream that viewers can join; a replay is served until Ctrl-C."""
     serve_address: Annotated[str, arg(metavar="HOST:PORT")] = "127.0.0.1:9876"
     """Where to serve it; the default lets only this machine in."""
     connect: Annotated[str | None, optional("URL")] = None

@@ -13,6 +13,7 @@ from typing import Self
 import cv2
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -134,7 +135,8 @@ class StepLogger:
             log("camera/gas/complement", complement)
         nodes_uv, kept = regions.nodes_uv + CENTRE, regions.triangles[regions.kept]
         outlines = nodes_uv[kept[:, (0, 1, 2, 0)]]
-        log("camera/gas/triangles", rr.LineStrips2D(outlines, colors=legend.MESH, radii=0.35))
+        strips = rr.LineStrips2D(_closed_strips(outlines), colors=legend.MESH, radii=0.35)
+        log("camera/gas/triangles", strips)
         log("camera/gas/nodes", rr.Points2D(nodes_uv, colors=legend.NODE, radii=1.4))
         nodes_m = regions.nodes_mm * np.float32(0.001)
         log("world/nodes", rr.Points3D(nodes_m, colors=legend.NODE, radii=-1.5))
@@ -197,16 +199,28 @@ def _middle_m(depth_mm: npt.NDArray[np.uint16]) -> float:
 
 
 def _as_depth(value_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
-    return np.nan_to_num(value_mm).clip(0, 65535).astype(np.uint16)
+    return np.where(value_mm > 0, value_mm, np.float32(0)).astype(np.uint16)
 
 
 def _map_image(
     value: npt.NDArray[np.float32], limit: float, known: npt.NDArray[np.bool_]
 ) -> rr.DepthImage:
     """Values of 0..limit as a coloured 8-bit image: 1..255, and 0 where nothing is known."""
-    level = np.clip(value * np.float32(254 / limit), 0, 254) + np.float32(1)
-    levels = np.where(known, level, 0).astype(np.uint8)
+    # Saturates in one pass; what it makes of a NaN does not matter, that is nowhere known.
+    levels = np.asarray(cv2.convertScaleAbs(value, alpha=254 / limit, beta=1))
+    np.multiply(levels, known, out=levels)
     return rr.DepthImage(levels, colormap="inferno", depth_range=[1.0, 255.0])
+
+
+def _closed_strips(points_uv: npt.NDArray[np.float32]) -> pa.Array:
+    """Line strips of shape (n, points, 2) as the SDK holds them, without its loop over n."""
+    count, length, _ = points_uv.shape
+    inner = rr.encodings.Vec2DBatch(points_uv.reshape(-1, 2)).as_arrow_array()
+    offsets = pa.array(np.arange(0, (count + 1) * length, length, dtype=np.int32))
+    return pa.ListArray.from_arrays(offsets, inner, type=_STRIPS)
+
+
+_STRIPS = rr.components.LineStrip2DBatch([]).as_arrow_array().type
 
 
 # How it is laid out
@@ -314,6 +328,9 @@ class Recording:
     ) -> None:
         self._stream = rr.RecordingStream(APPLICATION)
         self._stream.set_sinks(target)
+        # The SDK imports half of what it needs at first use, which takes it up to a second:
+        # that is now, and not while the first frames come.
+        blueprint(acquiring=True, detail=True)
         self._logger = StepLogger(self._stream, options)
 
     @classmethod

@@ -7,6 +7,7 @@ import os
 import random
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -133,6 +134,7 @@ def test_completion_knows_the_commands(shell: str, capsys: pytest.CaptureFixture
         (["replay", "x", "--gas.nodes", "many"], "--gas.nodes"),
         (["replay", "x", "--gas.algorithm", "slow"], "'exact', 'fast'"),
         (["replay", "x", "--frames", "0"], "--frames is 0; it must be 1 or more"),
+        (["replay", "x", "--threads", "0"], "--threads is 0"),
         (["replay", "x", "--budget", "2"], "--budget is 2.0; it must be a share between 0 and 1"),
         (["replay", "x", "--rounds", "0"], "--rounds is 0"),
         (["replay", "x", "--near-mm", "900", "--far-mm", "800"], "--far-mm is 800"),
@@ -308,6 +310,48 @@ def interrupt(tmp_path: Path, after_s: float | None, number: int = signal.SIGINT
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_run_ends_soon_and_keeps_its_file(tmp_path: Path, number: int) -> None:
     interrupt(tmp_path, None, number)
+
+
+def test_served_replay_stays_for_viewers_on_this_machine_only(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    scene = ENDLESS.replace("1000000", "3")
+    address = f"127.0.0.1:{port}"
+    process = start("replay", scene, *QUICK, "--serve", "--serve-address", address, cwd=tmp_path)
+    assert process.stdout is not None
+    said = [process.stdout.readline() for _ in range(2)]
+    assert f"rerun+http://{address}/proxy" in said[0]
+    assert "Ctrl-C ends" in said[1]
+    socket.create_connection(("127.0.0.1", port), 5).close()
+    for _, _, _, _, elsewhere in socket.getaddrinfo(socket.gethostname(), port, socket.AF_INET):
+        if elsewhere[0].startswith("127."):
+            continue
+        with pytest.raises(OSError, match="refused"):
+            socket.create_connection(elsewhere, 1)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=10)
+    assert process.returncode == 130, errors
+    assert "whole loop" in output
+
+
+@pytest.mark.openni
+def test_live_sensor_from_the_command_line(
+    virtual_sensor: object, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "live.rrd"
+    assert cli.run(["devices"]) == 0
+    assert "irtual" in capsys.readouterr().out
+    assert cli.run(["live", *QUICK, "--frames", "15", "--save", str(out)]) == 0
+    table = capsys.readouterr().out
+    assert "skipped to keep up" in table
+    assert "live" in table
+    assert depth_rows(out) == 15
+    recording = tmp_path / "Aufnahme groß.oni"
+    assert cli.run(["record", str(recording), "--frames", "10"]) == 0
+    written = re.search(r"(\d+) frames", capsys.readouterr().out)
+    assert written is not None
+    assert int(written[1]) >= 10
+    assert cli.run(["replay", str(recording), *QUICK]) == 0
 
 
 @pytest.mark.slow
