@@ -16,7 +16,7 @@ byte            meaning
 =============== =======================================================================
 
 OpenNI2's encoder has a flaw: a lone last pixel after a run is written before the run, and its
-player then shows up to 29 wrong pixels in the corner of the image. No other use of ``0xAD`` before
+player then shows up to 28 wrong pixels in the corner of the image. No other use of ``0xAD`` before
 a run is possible, so the true order is restored here. All other frames are those of OpenNI2 bit by
 bit. Unlike its player, every byte is checked: a damaged payload is an error where that can be
 known, and never an access out of bounds.

@@ -112,7 +112,7 @@ class OniReport:
         Number of depth frames that were also decoded, not only found.
     swapped_frames : int
         Number of these in which OpenNI2's recorder swapped the last pixels, so that its player
-        shows up to 29 wrong ones (see `oni_codec`). They are read rightly here.
+        shows up to 28 wrong ones (see `oni_codec`). They are read rightly here.
     """
 
     path: Path

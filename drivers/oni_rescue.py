@@ -78,7 +78,7 @@ def mend_oni(path: str | Path) -> int:
     """Put right, in place, the frames whose last pixels OpenNI2's recorder swapped.
 
     To be called after recording: the file is whole, but OpenNI2's own player and viewers would
-    show up to 29 wrong pixels in the corner of such a frame (see `oni_codec`). Two bytes of each
+    show up to 28 wrong pixels in the corner of such a frame (see `oni_codec`). Two bytes of each
     such frame change places, nothing else is touched.
 
     Returns
