@@ -12,13 +12,14 @@ ALPHA = (0.5, 0.005)
 """First and last learning rate. The first is the paper's; both are SOM Toolbox's defaults."""
 LAMBDA_LAST = 0.01
 """Last neighbourhood range (SOM Toolbox); the first is half the number of nodes, as published."""
-NEGLIGIBLE = 1e-3
-"""Nodes whose rank k has exp(-k / lambda) below this are left where they are."""
+NEGLIGIBLE = 1e-8
+"""Nodes whose rank k has exp(-k / lambda) below this are left where they are. Small enough that
+the result is that of moving every node at every step; at 1e-3 it is another, equally good one."""
 
 _MEMBERS = 16  # nodes per group; the nearest members of all groups are found in one sweep
 _FEW = 32  # up to here, ordering by comparing all with all is the faster way
 _SLACK = 1.2  # how much farther than expected the nodes that move are looked for
-_FAR = np.float32(1e18)  # where the padding of the last groups lies: its square is still finite
+_FAR = 1e18  # where the padding of the last groups lies: its square is still finite
 
 
 def draw_nodes(
@@ -47,9 +48,9 @@ def train_exact(
 
     Samples are drawn with replacement, ``epochs * len(points_mm)`` of them, and each moves the
     nodes by ``alpha(t) exp(-k / lambda(t))`` of their distance to it, k the node's rank (eq. 2, 3),
-    under the annealing of eq. 4. Ranks are exact; the one liberty is that a node of rank k with
-    ``exp(-k / lambda) < NEGLIGIBLE`` does not move, so that no step moves a node less than a
-    thousandth as far as its winner without being worth its time.
+    under the annealing of eq. 4. Ranks are exact; only nodes whose rank k has
+    ``exp(-k / lambda) < NEGLIGIBLE`` are not moved. In float64, because the nodes first gather in
+    one place, so close together that float32 could not tell them apart.
 
     Parameters
     ----------
@@ -96,16 +97,16 @@ def anneal(
     """
     count = len(nodes_mm)
     groups = -(-count // _MEMBERS)
-    padded = np.full((3, _MEMBERS * groups), _FAR, dtype=np.float32)
+    padded = np.full((3, _MEMBERS * groups), _FAR)
     padded[:, :count] = nodes_mm.T
-    _anneal(
-        np.ascontiguousarray(points_mm, dtype=np.float32),
+    settled: npt.NDArray[np.float32] = _anneal(
+        points_mm.astype(np.float64),
         padded.reshape(3, _MEMBERS, groups),
         count,
         draws,
         max(count / 2, LAMBDA_LAST),
     )
-    return np.ascontiguousarray(padded[:, :count].T)
+    return settled
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz", "contract"})
@@ -113,7 +114,7 @@ def _distances(x, y, z, nodes, d2, nearest):  # type: ignore[no-untyped-def]
     """Squared distance of every node, and the smallest of every group."""
     groups = len(nearest)
     for g in range(groups):
-        nearest[g] = np.float32(3e38)
+        nearest[g] = 1e300
     for m in range(_MEMBERS):
         # One-dimensional views: with them LLVM proves what it needs to vectorise.
         wx, wy, wz, out = nodes[0, m], nodes[1, m], nodes[2, m], d2[m]
@@ -168,29 +169,46 @@ def _order_few(key, found, count, order):  # type: ignore[no-untyped-def]
         order[rank] = found[i]
 
 
+@njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz", "contract"})
+def _largest(key, count, lanes):  # type: ignore[no-untyped-def]
+    """Largest of the keys, in as many lanes as `lanes` is long, so that it is vectorised."""
+    width = len(lanes)
+    for k in range(width):
+        lanes[k] = key[0]
+    for start in range(0, count - width + 1, width):
+        part = key[start : start + width]
+        for k in range(width):
+            lanes[k] = part[k] if part[k] > lanes[k] else lanes[k]
+    largest = key[0]
+    for k in range(width):
+        largest = max(largest, lanes[k])
+    for i in range(count - count % width, count):
+        largest = max(largest, key[i])
+    return largest
+
+
 @njit(cache=True, nogil=True)
-def _order_many(key, found, count, order, packed, spare, starts):  # type: ignore[no-untyped-def]
+def _order_many(key, found, count, largest, order, packed, spare, starts):  # type: ignore[no-untyped-def]
     """Order by two passes of a radix sort, over distance and place packed into 32 bits."""
-    place_bits = np.uint32(1)
-    while count > np.uint32(1) << place_bits:
-        place_bits += np.uint32(1)
+    one = np.uint32(1)
+    place_bits = one
+    while count > one << place_bits:
+        place_bits += one
     # Few keys need fewer buckets: clearing and summing those would take longer than the keys.
-    bits = min(np.uint32(32 - place_bits) >> np.uint32(1), np.uint32(10 if count > 600 else 7))
-    buckets = np.uint32(1) << bits
-    mask = buckets - np.uint32(1)
+    bits = min(np.uint32(32 - place_bits) >> one, np.uint32(10 if count > 600 else 7))
+    buckets = one << bits
+    mask = buckets - one
     to_high = place_bits + bits
     low, high = starts[0], starts[1]
     low[: buckets + 1] = 0
     high[: buckets + 1] = 0
-    largest = np.float32(1e-30)
+    scale = (buckets * buckets - 1) * 0.9999 / max(largest, 1e-300)
     for i in range(count):
-        largest = max(largest, key[i])
-    scale = np.float32((buckets * buckets - 1) * 0.9999 / largest)
+        packed[i] = np.uint32(key[i] * scale) << place_bits | np.uint32(i)
     for i in range(count):
-        step = np.uint32(key[i] * scale)
-        packed[i] = step << place_bits | np.uint32(i)
-        low[(step & mask) + np.uint32(1)] += np.uint32(1)
-        high[(step >> bits) + np.uint32(1)] += np.uint32(1)
+        step = packed[i] >> place_bits
+        low[(step & mask) + one] += one
+        high[(step >> bits) + one] += one
     for b in range(buckets):
         low[b + 1] += low[b]
         high[b + 1] += high[b]
@@ -198,13 +216,13 @@ def _order_many(key, found, count, order, packed, spare, starts):  # type: ignor
         item = packed[i]
         b = item >> place_bits & mask
         spare[low[b]] = item
-        low[b] += np.uint32(1)
+        low[b] += one
     for i in range(count):
         item = spare[i]
         b = item >> to_high
         packed[high[b]] = item
-        high[b] += np.uint32(1)
-    place = (np.uint32(1) << place_bits) - np.uint32(1)
+        high[b] += one
+    place = (one << place_bits) - one
     for i in range(count):
         item = packed[i]
         order[i] = found[item & place]
@@ -221,21 +239,88 @@ def _order_many(key, found, count, order, packed, spare, starts):  # type: ignor
 
 
 @njit(cache=True, nogil=True)
+def _weights(alpha, decay, weight, count):  # type: ignore[no-untyped-def]
+    """alpha * decay^k for all k, by doubling: free of a chain of products."""
+    weight[0] = alpha
+    done = 1
+    factor = decay
+    while done < count:
+        for k in range(done, min(2 * done, count)):
+            weight[k] = weight[k - done] * factor
+        done *= 2
+        factor *= factor
+
+
+@njit(cache=True, nogil=True)
+def _attract(x, y, z, nodes, share):  # type: ignore[no-untyped-def]
+    """Move every node by its share of the way."""
+    for m in range(_MEMBERS):
+        wx, wy, wz, h = nodes[0, m], nodes[1, m], nodes[2, m], share[m]
+        for g in range(len(h)):
+            wx[g] += h[g] * (x - wx[g])
+            wy[g] += h[g] * (y - wy[g])
+            wz[g] += h[g] * (z - wz[g])
+
+
+@njit(cache=True, nogil=True)
+def _regroup(nodes, name, count):  # type: ignore[no-untyped-def]
+    """Reorder the nodes along a space-filling curve, so that the members of a group are near."""
+    groups = nodes.shape[2]
+    flat = nodes.reshape((3, -1))
+    places = np.empty((3, count))
+    names = np.empty(count, np.uint32)
+    code = np.zeros(count, np.int64)
+    low, high = np.empty(3), np.empty(3)
+    at = np.empty(count, np.int64)
+    held = 0
+    for i in range(flat.shape[1]):
+        if name[i] < count:
+            at[held] = i
+            held += 1
+    for axis in range(3):
+        for i in range(count):
+            places[axis, i] = flat[axis, at[i]]
+        low[axis], high[axis] = places[axis].min(), places[axis].max()
+    extent = max((high - low).max(), 1e-300)
+    for i in range(count):
+        names[i] = name[at[i]]
+        for axis in range(3):
+            step = int((places[axis, i] - low[axis]) / extent * 1023)
+            for bit in range(10):
+                code[i] |= (step >> bit & 1) << (3 * bit + axis)
+    order = np.argsort(code)
+    flat[:] = _FAR
+    name[:] = count
+    for k in range(count):
+        i = (k % _MEMBERS) * groups + k // _MEMBERS
+        name[i] = names[order[k]]
+        for axis in range(3):
+            flat[axis, i] = places[axis, order[k]]
+
+
+@njit(cache=True, nogil=True)
 def _anneal(points, nodes, count, draws, lambda_first):  # type: ignore[no-untyped-def]
     groups = nodes.shape[2]
     size = _MEMBERS * groups
     wx, wy, wz = nodes[0].ravel(), nodes[1].ravel(), nodes[2].ravel()
-    d2 = np.empty((_MEMBERS, groups), np.float32)
+    d2 = np.empty((_MEMBERS, groups))
     flat_d2 = d2.ravel()
-    nearest = np.empty(groups, np.float32)
-    key = np.empty(size + 1, np.float32)
+    nearest = np.empty(groups)
+    key = np.empty(size + 1)
+    everyone = np.arange(size).astype(np.uint32)
     found = np.empty(size + 1, np.uint32)
     order = np.empty(size + 1, np.uint32)
     packed = np.empty(size + 1, np.uint32)
     spare = np.empty(size + 1, np.uint32)
     starts = np.empty((2, 1025), np.uint32)
+    weight = np.empty(size)
+    share = np.zeros((_MEMBERS, groups))
+    flat_share = share.ravel()
     # Squared distance of the farthest node moved, per node moved, when a point was last drawn.
-    reaches = np.full(len(points), np.float32(1e33), np.float32)
+    reaches = np.full(len(points), 1e33)
+    name = np.arange(size).astype(np.uint32)
+    regroup_at = count // 2  # from here on only the groups near a point are looked at
+    lanes = np.empty(64)
     cut = -math.log(NEGLIGIBLE)
     log_alpha = math.log(ALPHA[1] / ALPHA[0])
     log_lambda = math.log(LAMBDA_LAST / lambda_first)
@@ -244,39 +329,49 @@ def _anneal(points, nodes, count, draws, lambda_first):  # type: ignore[no-untyp
         p = draws[t]
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
         alpha = ALPHA[0] * math.exp(log_alpha * t / steps)
-        reach_ranks = lambda_first * math.exp(log_lambda * t / steps)
-        moving = min(count, int(cut * reach_ranks) + 1)
+        range_ = lambda_first * math.exp(log_lambda * t / steps)
+        moving = min(count, int(cut * range_) + 1)
+        if moving <= regroup_at:
+            _regroup(nodes, name, count)
+            regroup_at = moving // 4
         _distances(x, y, z, nodes, d2, nearest)
         if moving == 1:
             i = _winner(d2, nearest)
-            h = np.float32(alpha)
-            wx[i] += h * (x - wx[i])
-            wy[i] += h * (y - wy[i])
-            wz[i] += h * (z - wz[i])
+            wx[i] += alpha * (x - wx[i])
+            wy[i] += alpha * (y - wy[i])
+            wz[i] += alpha * (z - wz[i])
             continue
-        if moving == count:
-            for i in range(count):
-                key[i] = flat_d2[i]
-                found[i] = i
-            have = count
-        else:
-            # On a surface the number of nodes met grows like the square of the distance.
-            reach = reaches[p] * moving * np.float32(_SLACK)
+        _weights(alpha, math.exp(-1 / range_), weight, moving)
+        if moving > count // 2:
+            # Most nodes move: order them all, without looking for those in reach.
+            largest = _largest(flat_d2, count, lanes)
+            _order_many(flat_d2, everyone, count, largest, order, packed, spare, starts)
+            for k in range(moving):
+                flat_share[order[k]] = weight[k]
+            for k in range(moving, count):
+                flat_share[order[k]] = 0
+            _attract(x, y, z, nodes, share)
+            reaches[p] = flat_d2[order[moving - 1]] / moving
+            continue
+        # On a surface the number of nodes met grows like the square of the distance.
+        reach = reaches[p] * moving * _SLACK
+        have = _within(d2, nearest, reach, found, key)
+        while have < moving:
+            reach = reach * 1.5 + 1e-6
             have = _within(d2, nearest, reach, found, key)
-            while have < moving:
-                reach = reach * np.float32(1.5) + np.float32(1e-6)
-                have = _within(d2, nearest, reach, found, key)
         if have > _FEW:
-            _order_many(key, found, have, order, packed, spare, starts)
+            largest = _largest(key, have, lanes)
+            _order_many(key, found, have, largest, order, packed, spare, starts)
         else:
             _order_few(key, found, have, order)
-        reaches[p] = flat_d2[order[moving - 1]] / np.float32(moving)
-        decay = math.exp(-1.0 / reach_ranks)
-        weight = alpha
+        reaches[p] = flat_d2[order[moving - 1]] / moving
         for k in range(moving):
             i = order[k]
-            h = np.float32(weight)
-            wx[i] += h * (x - wx[i])
-            wy[i] += h * (y - wy[i])
-            wz[i] += h * (z - wz[i])
-            weight *= decay
+            wx[i] += weight[k] * (x - wx[i])
+            wy[i] += weight[k] * (y - wy[i])
+            wz[i] += weight[k] * (z - wz[i])
+    settled = np.empty((count, 3), np.float32)
+    for i in range(size):
+        if name[i] < count:
+            settled[name[i], 0], settled[name[i], 1], settled[name[i], 2] = wx[i], wy[i], wz[i]
+    return settled

@@ -149,17 +149,6 @@ def _mean_distance(d2: npt.NDArray[np.float32]) -> float:
     return float(np.sqrt(d2).mean(dtype=np.float64))
 
 
-def train_fast(
-    points_mm: npt.NDArray[np.float32],
-    uv: npt.NDArray[np.int32],
-    nodes: int,
-    seed: int,
-    threads: int | None = None,
-) -> BatchNeuralGas:
-    """Train neural gas from nothing by batch passes; see `BatchNeuralGas`."""
-    return BatchNeuralGas(nodes, seed, threads).train(points_mm, uv)
-
-
 @njit(cache=True, nogil=True)
 def _sort_into_bins(nodes, nodes_uv, bin_px, rows, columns):  # type: ignore[no-untyped-def]
     """Nodes ordered by image bin, as first index of each bin, node numbers and coordinates."""
