@@ -220,7 +220,7 @@ class Session:
         if picture and self.last is not None:
             step = self.last
             row = StillRow(
-                f"{self._uri}, frame {step.frame.index}",
+                f"{self._uri.rstrip('/').rpartition('/')[2]}, frame {step.frame.index}",
                 step.frame,
                 step.regions,
                 step.improvement,

@@ -6,6 +6,7 @@ import ctypes
 import importlib.util
 import os
 import socket
+import tempfile
 import time
 from pathlib import Path
 from typing import Self
@@ -80,6 +81,7 @@ class StepLogger:
             acquiring=step.acquisition is not None,
             detail=options.detail,
             look_at_m=_middle_m(step.frame.depth_mm),
+            limits_mm=self._limits_mm,
         )
         self._stream.send_blueprint(layout, make_default=True)
         self._stream.send_recording_name(step.frame.source or "depth")
@@ -226,7 +228,13 @@ _STRIPS = rr.components.LineStrip2DBatch([]).as_arrow_array().type
 # How it is laid out
 
 
-def blueprint(*, acquiring: bool, detail: bool, look_at_m: float = 2.0) -> rrb.Blueprint:
+def blueprint(
+    *,
+    acquiring: bool,
+    detail: bool,
+    look_at_m: float = 2.0,
+    limits_mm: tuple[float, float] = (500.0, 5000.0),
+) -> rrb.Blueprint:
     """Layout of the viewer, left to right in the order of the method.
 
     Parameters
@@ -237,11 +245,16 @@ def blueprint(*, acquiring: bool, detail: bool, look_at_m: float = 2.0) -> rrb.B
         Whether the inner read-outs have views too.
     look_at_m : float, default 2.0
         Depth around which the view in space turns, in metres.
+    limits_mm : tuple of float, default (500, 5000)
+        Ends of the depth scale.
     """
+
+    near, far = limits_mm
+    dim_range = [near - 0.3 * (far - near), far + 1.5 * (far - near)]
 
     def image(name: str, *entities: str, backdrop: bool = False) -> rrb.Spatial2DView:
         contents = [f"/camera/{entity}" for entity in entities]
-        grey = rr.DepthImage.from_fields(colormap="grayscale")
+        grey = rr.DepthImage.from_fields(colormap="grayscale", depth_range=dim_range)
         return rrb.Spatial2DView(
             origin="/camera",
             contents=contents + ["/camera/depth", "/camera/holes"] * backdrop,
@@ -271,7 +284,7 @@ def blueprint(*, acquiring: bool, detail: bool, look_at_m: float = 2.0) -> rrb.B
         )
         space.append("/world/samples")
     eye = rrb.EyeControls3D(
-        position=(-0.55 * look_at_m, -0.5 * look_at_m, -0.6 * look_at_m),
+        position=(-0.5 * look_at_m, -0.45 * look_at_m, -0.45 * look_at_m),
         look_target=(0, 0, look_at_m),
         eye_up=(0, -1, 0),
     )
@@ -435,6 +448,8 @@ def screenshot(recording: Path, picture: Path, frame: int | None = None) -> None
     """
     from rerun.experimental import ViewerClient
 
+    # The viewer complains on the terminal where there is none, as on a server.
+    os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = int(free.getsockname()[1])
     try:
