@@ -26,9 +26,11 @@ from primesense.utils import InitializationError, OpenNIError
 
 WAIT_S = 0.2  # longest uninterrupted wait for a frame, and the beat of "idle" messages
 SILENT_FILE_S = 5.0  # a file in lock-step delivers within milliseconds; beyond this it is stuck
+LEAVE_S = 3.0  # from the parent's end to this process's, at most
 SETTLE_S = 0.05  # between stop and close: the runtime's threads set their flags late
 RECORDER_START_S = 5.0  # for the recorder's own thread to write the file's beginning
 DATA_BEGIN = b"NIR\0\x08\0\0\0"  # the record after which it takes frames
+MILLIMETRES = int(openni2.PIXEL_FORMAT_DEPTH_1_MM)
 NO_GROWTH_S = 1.5  # a frame takes some 100 kB: a file that stops growing is not being written
 
 
@@ -62,24 +64,29 @@ class Parent:
         # Drivers print on standard output: the answers move to a descriptor of their own.
         self._out = os.dup(1)
         os.dup2(2, 1)
+        self._pid = os.getppid()
         self._commands = open(0, "rb", closefd=False)  # noqa: SIM115 - for all its life
         self.free_slots: queue.SimpleQueue[int] = queue.SimpleQueue()
         self.stop = threading.Event()
 
     def first_job(self) -> dict[str, Any]:
-        """What to do; from now on the pipe is listened to."""
+        """What to do; from now on the parent is watched."""
         line = self._commands.readline()
         if not line:
             os._exit(0)
         job: dict[str, Any] = json.loads(line)
-        threading.Thread(target=self._listen, daemon=True).start()
+        for watch in (self._listen, self._look_after):
+            threading.Thread(target=watch, daemon=True).start()
         return job
 
     def send(self, kind: str, **values: object) -> None:
         """Say one thing."""
         line = memoryview(json.dumps({"kind": kind, **values}).encode() + b"\n")
-        while line:
-            line = line[os.write(self._out, line) :]
+        try:
+            while line:
+                line = line[os.write(self._out, line) :]
+        except BrokenPipeError:
+            self.stop.set()  # there is nobody left to tell, but a recording still has to be ended
 
     def _listen(self) -> None:
         for line in self._commands:
@@ -88,10 +95,18 @@ class Parent:
                 self.free_slots.put(int(number))
             else:
                 self.stop.set()
-        # The pipe is closed: asked to go, or the parent is no more. A recording gets the time
-        # to end its file; nothing may outlive this, not even a hanging driver.
+        self._leave()  # the pipe is closed: asked to go, or the parent is no more
+
+    def _look_after(self) -> None:
+        """Notice the parent's end even if a process that it forked keeps our pipe open."""
+        while os.getppid() == self._pid:
+            time.sleep(0.5)
+        self._leave()
+
+    def _leave(self) -> None:
+        """Give a recording the time to end its file; nothing may outlive this, hanging or not."""
         self.stop.set()
-        time.sleep(3)
+        time.sleep(LEAVE_S)
         os._exit(1)
 
 
@@ -205,10 +220,16 @@ def choose(found: list[dict[str, Any]], wanted: str, like: dict[str, Any] | None
     return found[0]
 
 
+def mode_key(mode: Any) -> tuple[int, int, int, int]:
+    """A video mode to compare; the library's own has no equality."""
+    return mode.resolutionX, mode.resolutionY, mode.fps, int(mode.pixelFormat)
+
+
 def mode_text(mode: Any) -> str:
     """A video mode for people; the library's own `repr` raises."""
-    unit = {100: "mm", 101: "0.1 mm"}.get(int(mode.pixelFormat), f"format {mode.pixelFormat.value}")
-    return f"{mode.resolutionX}x{mode.resolutionY} at {mode.fps} fps in {unit}"
+    width, height, fps, pixels = mode_key(mode)
+    unit = {MILLIMETRES: "mm", 101: "0.1 mm"}.get(pixels, f"pixel format {pixels}")
+    return f"{width}x{height} at {fps} fps in {unit}"
 
 
 class Watch(openni2.DeviceListener):  # type: ignore[misc]
@@ -254,36 +275,38 @@ class LiveStream:
             ) from error
 
     def _configure(self, settings: dict[str, Any]) -> None:
+        """Set what is not yet as wanted, and nothing else: drivers refuse the odd setting."""
         stream = self.stream
-        size = settings["width"], settings["height"]
+        uri = self.info["uri"]
+        wanted = (settings["width"], settings["height"], settings["fps"], MILLIMETRES)
         modes = self.device.get_sensor_info(openni2.SENSOR_DEPTH).videoModes
-        wanted = [
-            mode
-            for mode in modes
-            if (mode.resolutionX, mode.resolutionY, mode.fps) == (*size, settings["fps"])
-            and int(mode.pixelFormat) == int(openni2.PIXEL_FORMAT_DEPTH_1_MM)
-        ]
-        if not wanted:
+        mode = next((mode for mode in modes if mode_key(mode) == wanted), None)
+        if mode is None:
             raise JobError(
                 "DeviceRefusedError",
-                f"The sensor {self.info['uri']} cannot give {size[0]}x{size[1]} at"
-                f" {settings['fps']} fps in mm. It offers: {'; '.join(map(mode_text, modes))}.",
+                f"The sensor {uri} cannot give {wanted[0]}x{wanted[1]} at {wanted[2]} fps in mm."
+                f" It offers: {'; '.join(map(mode_text, modes))}.",
             )
-        if stream.is_property_supported(c_api.ONI_STREAM_PROPERTY_CROPPING):
+        if stream.is_cropping_supported() and stream.get_cropping().enabled:
             stream.reset_cropping()
-        stream.set_video_mode(wanted[0])
-        if stream.is_property_supported(c_api.ONI_STREAM_PROPERTY_MIRRORING):
+        if mode_key(stream.get_video_mode()) != wanted:
+            stream.set_video_mode(mode)
+        mirrored = stream.is_property_supported(c_api.ONI_STREAM_PROPERTY_MIRRORING)
+        if mirrored and stream.get_mirroring_enabled():
             # Mirroring, where wanted, is the parent's: libfreenect's writes out of bounds.
             stream.set_mirroring_enabled(False)
-        registration = (
-            openni2.IMAGE_REGISTRATION_DEPTH_TO_COLOR
-            if settings["registration"]
-            else openni2.IMAGE_REGISTRATION_OFF
+        self._register(settings["registration"])
+
+    def _register(self, wanted: bool) -> None:
+        device = self.device
+        mode = (
+            openni2.IMAGE_REGISTRATION_DEPTH_TO_COLOR if wanted else openni2.IMAGE_REGISTRATION_OFF
         )
-        if self.device.is_image_registration_mode_supported(registration):
-            if self.device.is_property_supported(c_api.ONI_DEVICE_PROPERTY_IMAGE_REGISTRATION):
-                self.device.set_image_registration_mode(registration)
-        elif settings["registration"]:
+        known = device.is_property_supported(c_api.ONI_DEVICE_PROPERTY_IMAGE_REGISTRATION)
+        if known and device.is_image_registration_mode_supported(mode):
+            if device.get_image_registration_mode() != mode:
+                device.set_image_registration_mode(mode)
+        elif wanted:
             raise JobError(
                 "DeviceRefusedError",
                 f"The sensor {self.info['uri']} cannot register depth to its colour camera.",
@@ -340,7 +363,7 @@ def misfit(frame: Any, width: int, height: int) -> str:
         return "it is {}x{} (stride {}, {} bytes), expected {}x{} (stride {}, {} bytes)".format(
             *got, *expected
         )
-    if int(frame.videoMode.pixelFormat) != int(openni2.PIXEL_FORMAT_DEPTH_1_MM):
+    if int(frame.videoMode.pixelFormat) != MILLIMETRES:
         return f"it is {mode_text(frame.videoMode)}, expected depth in mm"
     return ""
 
@@ -365,6 +388,8 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
     live.start()
     parent.send("opened", **about)
     width, height = about["width"], about["height"]
+    if not slots.fits(width * height * 2):
+        raise JobError("DeviceRefusedError", f"Frames of {width}x{height} pixels are too large.")
     last_frame = time.monotonic()
     while not parent.stop.is_set():
         if live.watch.lost.is_set():
@@ -563,33 +588,17 @@ def forbid_core_dumps() -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def watch_parent() -> None:
-    """End with the parent even if a process that it forked keeps our pipe open."""
-    parent = os.getppid()
-
-    def wait() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        time.sleep(3)
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
 def main() -> None:
     """Do the one job that the parent asks for, then leave without a farewell."""
     # Ctrl-C reaches every process of a terminal; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     forbid_core_dumps()
     parent = Parent()
-    watch_parent()
     job = parent.first_job()
     try:
         JOBS[job["job"]](job, parent)
     except JobError as error:
         parent.send("error", error=error.kind, message=str(error), remedy=error.remedy)
-    except BrokenPipeError:
-        pass  # The parent is gone: there is nobody left to tell.
     except Exception as error:  # noqa: BLE001 - the parent turns it into a named error
         kind = "DamagedRecordingError" if job["job"] == "recording" else "DeviceLostError"
         parent.send("error", error=kind, message=f"OpenNI2 failed: {reason(error)}.", remedy="")

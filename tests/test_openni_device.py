@@ -341,7 +341,7 @@ def test_two_hundred_cycles_of_open_read_three_close(virtual_sensor: VirtualSens
 
 
 READER = """
-import sys
+import os, signal, sys, time
 from selective_depth.drivers.openni import OpenNIDevice
 device = OpenNIDevice()
 device.read()
@@ -352,11 +352,24 @@ while True:
         raise RuntimeError("on purpose")
     if sys.argv[1] == "exit":
         break
+    if sys.argv[1] == "killed while its fork lives on":
+        if os.fork() == 0:  # which holds every pipe open
+            time.sleep(3)
+            os._exit(0)
+        os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
 @pytest.mark.parametrize(
-    "end", ["exit", "exception", signal.SIGINT, signal.SIGTERM, signal.SIGKILL]
+    "end",
+    [
+        "exit",
+        "exception",
+        "killed while its fork lives on",
+        signal.SIGINT,
+        signal.SIGTERM,
+        signal.SIGKILL,
+    ],
 )
 def test_nothing_is_left_whichever_way_the_program_ends(
     virtual_sensor: VirtualSensor, end: str | signal.Signals
