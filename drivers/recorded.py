@@ -119,7 +119,7 @@ class RecordedFolder(DepthSource):
         if self._closed:
             raise SourceEndedError(f"'{self.uri}' was closed; open it again to read it again.")
         if self._next == self.frame_count:
-            raise SourceEndedError(f"all {self.frame_count} frames of '{self.uri}' were delivered.")
+            raise SourceEndedError(f"'{self.uri}' has ended after frame {self._next}.")
         ahead = self._ahead or self._reader.submit(self._load, self._next)
         try:
             frame = ahead.result(timeout_s)
@@ -368,7 +368,7 @@ def _nothing_found(path: Path) -> str:
     )
     for inner in sorted(path.iterdir()):
         if inner.is_dir() and (count := len(_png_names(inner))):
-            return f"{looked}. There are {count} PNG files in '{inner}': give that folder."
+            return f"{looked}. '{inner}' holds PNG files ({count}): give that folder."
     return f"{looked}, and for depth.txt. Give a folder that holds them."
 
 

@@ -114,9 +114,8 @@ def _replay_repaired(
 
 def _try(name: str, path: Path, outcome: Outcome, expected: list[DepthFrame]) -> Iterator[str]:
     """Check what is made of one damaged file; yield what to count."""
-    yield f"OpenNI2 alone: {outcome.ended}"
     quick, thorough = _timed(name, path, decode=False), _timed(name, path, decode=True)
-    yield f"check: {'openable' if quick else 'refused'}"
+    yield f"OpenNI2 alone: {outcome.ended}; check: {'openable' if quick else 'refused'}"
     assert quick >= thorough, f"{name}: decoding made a file better"
     assert outcome.unharmed or not quick, f"{name}: openable, but OpenNI2 ends in {outcome}"
 
