@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
@@ -315,8 +316,9 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _dispatch(words: list[str], verbose: bool) -> int:
+    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(message)s")
     # The viewer's SDK logs in its own way to the terminal; its warnings are told in ours.
-    os.environ.setdefault("RUST_LOG", "info" if verbose else "off")
+    os.environ.setdefault("RUST_LOG", "warn" if verbose else "off")
     if not words or words[0] in ("-h", "--help", "help"):
         print(overview(EXAMPLES))
         return OK

@@ -84,6 +84,13 @@ class FrameProgress:
             total = f" of {self._total}" if self._total else ""
             sys.stderr.write(f"{self._what}: {frames}{total} frames {note}".rstrip() + "\n")
 
+    def say(self, sentence: str) -> None:
+        """Tell something at once, above the bar."""
+        if self._bar is not None:
+            self._bar.console.print(sentence, highlight=False)
+        else:
+            sys.stderr.write(f"{sentence}\n")
+
     def __enter__(self) -> Self:
         if self._bar is not None:
             self._bar.start()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
 import threading
 import time
@@ -29,6 +30,9 @@ from selective_depth.drivers.source import (
     SourceTimeoutError,
     open_source,
 )
+from selective_depth.selectors.parallel import default_threads
+
+log = logging.getLogger(__name__)
 
 OK, FAILED, INTERRUPTED = 0, 1, 130
 LEAVE_S = 2.8
@@ -132,6 +136,7 @@ class Session:
             if self.settings.run.realtime and not source.live:
                 source = stack.enter_context(RealtimeSource(source))
             report.live = source.live
+            _tell(source)
             seen = _with_a_place(self.settings.viewer, self._uri)
             self.settings = dataclasses.replace(self.settings, viewer=seen)
             loop = stack.enter_context(Loop(self.settings, every_model=not source.live))
@@ -166,10 +171,12 @@ class Session:
         with FrameProgress(self._uri, total) as progress:
             for frame in self._frames(source, loop, viewer, progress):
                 if self.report.frames == 0:
+                    began_s = time.monotonic()
                     with waiting("Compiling for this machine; the next run starts at once"):
                         loop.warm_up(frame)
                         viewer.wait_ready()
                     start_s = recent[0] = time.monotonic()
+                    log.info("ready after %.1f s", start_s - began_s)
                 step = loop.turn(frame, _state(source))
                 recent.append(time.monotonic())
                 fps = (len(recent) - 1) / (recent[-1] - recent[0])
@@ -183,7 +190,9 @@ class Session:
         self, source: DepthSource, loop: Loop, viewer: Viewer, progress: FrameProgress
     ) -> Iterator[DepthFrame]:
         """All frames; a live source that has none shows its state meanwhile."""
+        state = _state(source)
         while True:
+            frame = None
             try:
                 with loop.times.stage("read"):
                     frame = source.read(POLL_S) if source.live else source.read()
@@ -193,8 +202,11 @@ class Session:
                 if not source.live:
                     raise
                 viewer.show(StateNote(_state(source)))
-                progress.update(self.report.frames, f"sensor {_state(source)}")
-            else:
+            if _state(source) != state:
+                state = _state(source)
+                reason = getattr(source, "state_reason", "")
+                progress.say(f"sensor {state}{': ' if reason else ''}{reason}")
+            if frame is not None:
                 yield frame
 
     def _show(
@@ -229,6 +241,23 @@ class Session:
             beside.append(saved.with_suffix(".png"))
             save_png(beside[2], contact_sheet([row]))
         self.report.written += beside
+
+
+def _tell(source: DepthSource) -> None:
+    camera, count = source.camera, source.frame_count
+    log.info(
+        "%s: %s frames, %dx%d, %.4g frames/s, fx %.1f fy %.1f cx %.1f cy %.1f; %d kernel threads",
+        source.uri,
+        "endless" if count is None else count,
+        camera.width,
+        camera.height,
+        source.fps,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        default_threads(),
+    )
 
 
 def _leave_soon() -> None:
