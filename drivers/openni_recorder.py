@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -33,7 +34,7 @@ class RecordingReport:
     frames : int
         Frames in it, counted by opening it again.
     seconds : float
-        How long was recorded.
+        How long was recorded, from the sensor's start to the file's end.
     ended : str
         ``"done"``, ``"interrupted"`` or, in words, what ended it early.
     problem : str
@@ -91,7 +92,6 @@ def record(
     # Under another name until the sensor streams: an older recording is not lost for nothing.
     unborn = path.with_name(path.name + ".part")
     file = _create(path, unborn, overwrite)
-    started = time.monotonic()
     try:
         worker = Worker(
             "record",
@@ -109,18 +109,21 @@ def record(
         try:
             _wait_for_stream(worker)
             unborn.replace(path)
+            started = time.monotonic()
             ended, seen = _follow(worker, progress)
+            seconds = time.monotonic() - started
         finally:
             worker.close(grace_s=1.0)
     finally:
         os.close(file)
         unborn.unlink(missing_ok=True)
-    seconds = time.monotonic() - started
     counted, problem = _verify(path, seen)
     return RecordingReport(path, counted, seconds, ended, problem)
 
 
 def _create(path: Path, unborn: Path, overwrite: bool) -> int:
+    if sys.platform == "win32":
+        raise OutputError("Recording works on Linux and macOS; on Windows record with NiViewer.")
     if path.suffix.lower() != ".oni":
         raise OutputError(f"'{path}' must end in .oni to be a recording.")
     if path.is_dir():
