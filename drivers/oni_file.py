@@ -52,7 +52,12 @@ CODECS: Final = frozenset((*DEPTH_CODECS, b"JPEG", b"Im8z"))
 _MAX_NODES: Final = 64
 _MILLIMETRES: Final = 100
 """OpenNI2's number of the pixel format "depth in millimetres"."""
-_SIZES: Final = {"xnMapOutputMode": 12, "xnCropping": 12, "xnFOV": 16}
+_SIZES: Final = {
+    "xnMapOutputMode": 12,
+    "xnCropping": 12,
+    "xnFOV": 16,
+    "xnRealWorldTranslationData": 24,
+}
 _SCAN_BYTES: Final = 1 << 20
 
 
@@ -409,13 +414,19 @@ class _Inspection:
         return self._camera(node, width, height), fps
 
     def _camera(self, node: OniNode, width: int, height: int) -> Camera:
-        fov = node.values_of("xnFOV", "<dd")
-        if fov is not None:
-            try:
-                return Camera.from_fov(width, height, *fov)
-            except ValueError as error:
-                del node.properties["xnFOV"]
-                self._problem(node.offset, f"{error}")
+        fov_rad = node.values_of("xnFOV", "<dd")
+        optics = node.values_of("xnRealWorldTranslationData", "<ddd")
+        try:
+            if fov_rad is None and optics is not None:
+                # OpenNI 1 at first recorded the size of a pixel at a distance instead.
+                distance, pixel_size, pixels_to_depth = optics
+                focal = distance / (pixel_size * pixels_to_depth)
+                return Camera(width, height, focal, focal, width / 2, height / 2)
+            if fov_rad is not None:
+                return Camera.from_fov(width, height, *fov_rad)
+        except (ValueError, ArithmeticError) as error:
+            node.properties.pop("xnFOV", None)
+            self._problem(node.offset, f"the field of view is wrong: {error}")
         return Camera.kinect(width, height)
 
     def _decode_frames(self, node: OniNode, camera: Camera) -> tuple[int, int]:

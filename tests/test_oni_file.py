@@ -40,6 +40,7 @@ from selective_depth.drivers.oni_writer import (
     RecordWriter,
     depth_properties,
     integer,
+    structure,
     write_oni,
 )
 from selective_depth.drivers.openni_runtime import find_runtime
@@ -411,7 +412,7 @@ def test_every_wrong_number_is_found_and_named(
         ("xnMapOutputMode", None, "frame size is not recorded"),
         ("xnCropping", None, "would deliver no frame at all"),
         ("xnCropping", struct.pack("<IHHHH", 1, 0, 0, 8, 8), "cropped"),
-        ("xnFOV", struct.pack("<dd", float("nan"), 0.7), "field of view is nan"),
+        ("xnFOV", struct.pack("<dd", float("nan"), 0.7), "field of view is wrong: "),
         ("oniRequiredFrameSize", (5).to_bytes(8, "little"), "do not have 5 bytes"),
         ("xnDeviceMaxDepth", (0).to_bytes(8, "little"), "largest depth cannot be 0"),
         ("oniPixelFormat", (200).to_bytes(8, "little"), "have format 200"),
@@ -497,7 +498,10 @@ def test_files_of_openni_1_are_read_and_brought_up_to_date(tmp_path: Path) -> No
         )
 
     add(Kind.NODE_ADDED_4, b"\x07\0\0\0Depth1\0" + struct.pack("<I4s", NodeType.DEPTH, b"16zT"))
-    for name, (kind, value) in depth_properties(CAMERA, 30).items():
+    properties = depth_properties(CAMERA, 30)
+    del properties["xnFOV"]
+    properties["xnRealWorldTranslationData"] = structure("<ddd", 120.0, 0.1, 2.0)
+    for name, (kind, value) in properties.items():
         add(kind, pack_property(name, value))
     add(Kind.STATE_READY)
     add(Kind.DATA_BEGIN, BEGIN_FIELDS.pack(COUNT, 10**9))
@@ -510,8 +514,11 @@ def test_files_of_openni_1_are_read_and_brought_up_to_date(tmp_path: Path) -> No
     path.write_bytes(out)
     report = inspect_oni(path, decode=True)
     assert report.problems == () and report.old and report.complete
+    assert report.camera == Camera(80, 60, 600.0, 600.0, 40.0, 30.0)
     _assert_same(_read(path), _frames())
-    assert not repair_oni(path, tmp_path / "new.oni").old
+    repaired = repair_oni(path, tmp_path / "new.oni")
+    assert not repaired.old and repaired.camera is not None
+    assert repaired.camera.fx == pytest.approx(600)
     _assert_same(_read(tmp_path / "new.oni"), _frames())
 
 
