@@ -43,11 +43,11 @@ def sound(oni_sample: OniSample) -> bytes:
 
 
 def test_short(sound: bytes, tmp_path: Path) -> None:
-    _fuzz(sound, tmp_path, mutated=40, cut=10, seed=1)
+    _fuzz(sound, tmp_path, mutated=30, cut=8, seed=1)
 
 
 def test_repaired_files_replay_through_openni2(sound: bytes, tmp_path: Path) -> None:
-    _replay_repaired(sound, tmp_path, mutated=12, cut=6, seed=5)
+    _replay_repaired(sound, tmp_path, mutated=8, cut=4, seed=5)
 
 
 @pytest.mark.slow
