@@ -262,6 +262,98 @@ def snapshot(
 
 
 @command(
+    "Pictures",
+    (f"{PROGRAM} epochs bunny.ply", "the paper's Fig. 1, to epochs.png"),
+    (f"{PROGRAM} epochs bunny.ply?side=left --save epochs.rrd", "and on an epoch timeline"),
+)
+def epochs(
+    source: Source,
+    /,
+    out: Annotated[Path, arg(metavar="FILE")] = Path("epochs.png"),
+    save: Annotated[Path | None, optional("FILE.rrd")] = None,
+    frame: Annotated[int, arg(metavar="N")] = 0,
+    seed: Annotated[int, arg(metavar="N")] = 0,
+) -> int:
+    """Show neural gas after 5, 10, 25, 40, 60 and 100 epochs of one frame.
+
+    Parameters
+    ----------
+    source : str
+        An object as .ply, or anything else that 'replay' takes.
+    out : Path
+        The picture to make, .png or .webp.
+    save : Path
+        Write a Rerun recording as well, by epoch.
+    frame : int
+        Which frame of the source, from 0.
+    seed : int
+        Seed of the random draws.
+    """
+    from selective_depth.app.figures import draw_epochs
+
+    return draw_epochs(source, out, save=save, number=frame, seed=seed)
+
+
+@command(
+    "Pictures",
+    (f"{PROGRAM} densities bunny.ply", "the paper's Fig. 2, to densities.png"),
+)
+def densities(
+    source: Source,
+    /,
+    out: Annotated[Path, arg(metavar="FILE")] = Path("densities.png"),
+    frame: Annotated[int, arg(metavar="N")] = 0,
+    epochs: Annotated[int, arg(metavar="N")] = 50,
+    seed: Annotated[int, arg(metavar="N")] = 0,
+) -> int:
+    """Show what neural gas finds from first scans of 32x32, 40x40, 64x64 and 75x75 points.
+
+    Parameters
+    ----------
+    source : str
+        An object as .ply, or anything else that 'replay' takes.
+    out : Path
+        The picture to make, .png or .webp.
+    frame : int
+        Which frame of the source, from 0.
+    epochs : int
+        Training length.
+    seed : int
+        Seed of the random draws.
+    """
+    from selective_depth.app.figures import draw_densities
+
+    return draw_densities(source, out, number=frame, epochs=epochs, seed=seed)
+
+
+@command(
+    "Compare",
+    (f"{PROGRAM} nodes frames/", "time, error and regions, on frame 0"),
+    (f"{PROGRAM} nodes frames/ --every 60 --out nodes.md", "mean over every 60th frame"),
+)
+def nodes(
+    source: Source,
+    /,
+    every: Annotated[int | None, optional("N")] = None,
+    out: Annotated[Path | None, optional("FILE.md")] = None,
+) -> int:
+    """Tabulate neural gas over numbers of nodes and of epochs; takes minutes.
+
+    Parameters
+    ----------
+    source : str
+        Anything that 'replay' takes.
+    every : int
+        Take every so many frames; by default the first alone.
+    out : Path
+        Write the table as Markdown as well.
+    """
+    from selective_depth.app.figures import tabulate_nodes
+
+    return tabulate_nodes(source, every=every, out=out)
+
+
+@command(
     "Compare",
     (f"{PROGRAM} bench", "every stage on the bundled recording"),
     (f"{PROGRAM} bench frames/ --json out.json", "on your own, to a file as well"),

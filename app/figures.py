@@ -5,11 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.app.errors import UsageError
+from selective_depth.app.progress import waiting
+from selective_depth.app.report import say
+from selective_depth.app.snapshot import nth_frame
 from selective_depth.app.stills import (
     GAP,
     INK,
@@ -21,6 +27,7 @@ from selective_depth.app.stills import (
     write_text,
 )
 from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.source import OutputError, open_source
 from selective_depth.selectors.neural_gas import NeuralGasSelector
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.regions import EdgeMetric, RegionSelection, delaunay_regions
@@ -312,8 +319,8 @@ def node_table(
                     share
                     for region in (chosen.mask, chosen.complement)
                     for share in (
-                        np.count_nonzero(region & known) / max(np.count_nonzero(known), 1),
-                        square[region].sum() / max(square.sum(), 1e-12),
+                        float(region[known].mean()) if known.any() else 0.0,
+                        float(square[region].sum() / max(square.sum(), 1e-12)),
                     )
                 ]
                 rows.append((seconds, chosen.quantisation_error_mm, *shares))
@@ -352,3 +359,90 @@ def table_markdown(rows: Sequence[TableRow]) -> str:
             f" {row.quantisation_error_mm:.2f} | {shares} |"
         )
     return "\n".join(lines) + "\n"
+
+
+# The commands
+
+
+def draw_epochs(source: str, out: Path, *, save: Path | None, number: int, seed: int) -> int:
+    """Make Fig. 1 of a frame of a source, and a Rerun recording of it; returns the exit code.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    UsageError
+        If the picture is of a kind that cannot be made, or there is no such frame.
+    """
+    _check_picture(out)
+    frame = nth_frame(source, number)
+    seeds = object_seeds(frame, FIRST_POINTS)
+    with waiting(f"training {len(EPOCHS)} times"):
+        trained = list(epoch_selections(seeds, seed=seed))
+    _save_picture(out, epochs_figure(frame, seeds, trained))
+    say(f"wrote {out}")
+    if save is not None:
+        from selective_depth.app.viewer import save_trainings
+
+        save_trainings(save, frame, ((length, chosen["3d"]) for length, chosen in trained))
+        say(f"wrote {save}; open it with 'rerun {save}'")
+    return 0
+
+
+def draw_densities(source: str, out: Path, *, number: int, epochs: int, seed: int) -> int:
+    """Make Fig. 2 of a frame of a source; returns the exit code. Raises as `draw_epochs`."""
+    _check_picture(out)
+    frame = nth_frame(source, number)
+    with waiting(f"training {len(DENSITIES)} times"):
+        figure = densities_figure(frame, epochs=epochs, seed=seed)
+    _save_picture(out, figure)
+    say(f"wrote {out}")
+    return 0
+
+
+def tabulate_nodes(source: str, *, every: int | None, out: Path | None) -> int:
+    """Print the table of nodes and epochs, and write it; returns the exit code.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    UsageError
+        If `every` is not allowed.
+    """
+    if every is not None and every < 1:
+        raise UsageError(f"--every is {every}; it must be 1 or more.")
+    if out is not None and not out.resolve().parent.is_dir():
+        raise OutputError(f"'{out}' cannot be written: its folder does not exist.")
+    with open_source(source) as opened:
+        frames = list(islice(opened, 0, None if every else 1, every or 1))
+    if not frames:
+        raise UsageError(f"'{source}' has no frame to tabulate.")
+    rows = []
+    for row in node_table(frames):
+        rows.append(row)
+        say(f"{row.nodes:,} nodes, {row.training}: {row.seconds:.3g} s")
+    table = table_markdown(rows)
+    say(table)
+    if out is not None:
+        try:
+            out.write_text(table, encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"'{out}' cannot be written: {error.strerror}.") from None
+    return 0
+
+
+def _check_picture(path: Path) -> None:
+    """Refuse before the work is done, not after."""
+    if path.suffix.lower() not in (".png", ".webp"):
+        raise UsageError(f"--out is '{path}'; pictures end in .png or .webp.")
+    if not path.resolve().parent.is_dir():
+        raise OutputError(f"'{path}' cannot be written: its folder does not exist.")
+
+
+def _save_picture(path: Path, image: Image) -> None:
+    _, data = cv2.imencode(path.suffix.lower(), image, [cv2.IMWRITE_WEBP_QUALITY, 85])
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from None

@@ -8,6 +8,7 @@ import os
 import socket
 import tempfile
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Self
 
@@ -23,6 +24,9 @@ from selective_depth.app.errors import ViewerError
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.step import StateNote, Step
 from selective_depth.app.timing import STAGES
+from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.source import OutputError
+from selective_depth.selectors.regions import RegionSelection
 
 APPLICATION = "selective-depth"
 DEPTH_COLOURS = legend.palette(cv2.COLORMAP_VIRIDIS)
@@ -60,10 +64,29 @@ class StepLogger:
         elapsed_us = step.frame.timestamp_us - self._start_us
         self._stream.set_time("time", duration=elapsed_us / 1e6)
         self._log_sensor(step)
-        self._log_gas(step)
+        self._log_gas(step.regions)
         self._log_improvement(step)
         self._log_acquisition(step)
         self._log_figures(step)
+
+    def log_trainings(
+        self, frame: DepthFrame, trainings: Iterable[tuple[int, RegionSelection]]
+    ) -> None:
+        """Log the regions of one frame after trainings of several lengths, by epoch."""
+        near, far = legend.depth_limits_mm(frame.depth_mm)
+        self._limits_mm = (float(near), float(far))
+        self._stream.send_blueprint(epoch_blueprint(self._limits_mm), make_default=True)
+        self._stream.send_recording_name(f"epochs of {frame.source}")
+        self._log_camera(frame.camera)
+        self._log_classes()
+        holes = rr.SegmentationImage((frame.depth_mm == 0).view(np.uint8), opacity=1.0)
+        self._stream.log("camera/depth", self._depth_image(frame.depth_mm), static=True)
+        self._stream.log("camera/holes", holes, static=True)
+        for epoch, regions in trainings:
+            self._stream.set_time("epoch", sequence=epoch)
+            self._log_gas(regions)
+            error = rr.Scalars(regions.quantisation_error_mm)
+            self._stream.log("figures/quantisation_error_mm", error)
 
     def log_state(self, state: str) -> None:
         """Log the sensor's state, if it has changed, under the time of the last step."""
@@ -85,24 +108,10 @@ class StepLogger:
         )
         self._stream.send_blueprint(layout, make_default=True)
         self._stream.send_recording_name(step.frame.source or "depth")
-        log("/", rr.ViewCoordinates.RDF, static=True)
-        pinhole = rr.Pinhole(
-            resolution=[camera.width, camera.height],
-            focal_length=[camera.fx, camera.fy],
-            principal_point=[camera.cx + CENTRE, camera.cy + CENTRE],
-            image_plane_distance=0.3,
-        )
-        log("camera", pinhole, static=True)
+        self._log_camera(camera)
         pixels = step.seeds.lattice_uv.reshape(-1, 2) + CENTRE
         log("camera/seeds", rr.Points2D.from_fields(positions=pixels, radii=1.6), static=True)
-        for path, label, colour in (
-            ("camera/holes", "no measurement", legend.HOLE),
-            ("camera/improvement/unknown", "too far from any sample", legend.HOLE),
-            ("camera/gas/mask", "kept triangles", legend.REGION),
-            ("camera/gas/complement", "long-edge triangles", legend.LONG_EDGE),
-        ):
-            classes = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, label, colour)])
-            log(path, classes, static=True)
+        self._log_classes()
         rounds = 0 if step.acquisition is None else int(step.acquisition.round.max(initial=0))
         log("legend", rr.Image(legend.picture(self._limits_mm, rounds)), static=True)
         log("guide", rr.TextDocument(legend.HOW_TO_READ, media_type="text/markdown"), static=True)
@@ -117,6 +126,28 @@ class StepLogger:
         for name, (label, colour) in legend.FIGURES.items():
             log(f"figures/{name}", rr.SeriesLines(names=label, colors=colour), static=True)
 
+    def _log_camera(self, camera: Camera) -> None:
+        log = self._stream.log
+        log("/", rr.ViewCoordinates.RDF, static=True)
+        pinhole = rr.Pinhole(
+            resolution=[camera.width, camera.height],
+            focal_length=[camera.fx, camera.fy],
+            principal_point=[camera.cx + CENTRE, camera.cy + CENTRE],
+            image_plane_distance=0.3,
+        )
+        log("camera", pinhole, static=True)
+
+    def _log_classes(self) -> None:
+        log = self._stream.log
+        for path, label, colour in (
+            ("camera/holes", "no measurement", legend.HOLE),
+            ("camera/improvement/unknown", "too far from any sample", legend.HOLE),
+            ("camera/gas/mask", "kept triangles", legend.REGION),
+            ("camera/gas/complement", "long-edge triangles", legend.LONG_EDGE),
+        ):
+            classes = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, label, colour)])
+            log(path, classes, static=True)
+
     def _log_sensor(self, step: Step) -> None:
         log, depth_mm, seeds = self._stream.log, step.frame.depth_mm, step.seeds
         log("camera/depth", self._depth_image(depth_mm))
@@ -129,8 +160,8 @@ class StepLogger:
         log("camera/seeds", rr.Points2D.from_fields(colors=colours))
         self.log_state(step.state)
 
-    def _log_gas(self, step: Step) -> None:
-        log, regions = self._stream.log, step.regions
+    def _log_gas(self, regions: RegionSelection) -> None:
+        log = self._stream.log
         log("camera/gas/mask", rr.SegmentationImage(regions.mask.view(np.uint8)))
         if self._options.detail:
             complement = rr.SegmentationImage(regions.complement.view(np.uint8))
@@ -318,6 +349,61 @@ def blueprint(
         rrb.SelectionPanel(state="collapsed"),
         auto_views=False,
     )
+
+
+def epoch_blueprint(limits_mm: tuple[float, float]) -> rrb.Blueprint:
+    """Layout for trainings of several lengths: nodes, kept triangles and long edges, in space."""
+    near, far = limits_mm
+    grey = rr.DepthImage.from_fields(
+        colormap="grayscale", depth_range=[near - 0.3 * (far - near), far + 1.5 * (far - near)]
+    )
+
+    def image(name: str, *entities: str) -> rrb.Spatial2DView:
+        contents = ["/camera/depth", "/camera/holes", *(f"/camera/gas/{name}" for name in entities)]
+        return rrb.Spatial2DView(
+            origin="/camera", contents=contents, overrides={"/camera/depth": grey}, name=name
+        )
+
+    space = rrb.Spatial3DView(
+        origin="/", contents=["/world/nodes", "/world/regions"], name="In space"
+    )
+    error = rrb.TimeSeriesView(origin="/figures", name="Quantisation error in mm")
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(image("Nodes", "nodes"), image("Long edges", "complement")),
+            image("Kept triangles", "mask", "triangles"),
+            rrb.Vertical(space, error, row_shares=[2, 1]),
+        ),
+        rrb.TimePanel(timeline="epoch", state="expanded"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+    )
+
+
+def save_trainings(
+    path: Path, frame: DepthFrame, trainings: Iterable[tuple[int, RegionSelection]]
+) -> None:
+    """Write an .rrd of one frame's regions after trainings of several lengths.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    try:
+        with path.open("wb"):
+            pass
+    except OSError as error:
+        raise OutputError(
+            f"cannot write '{path}': {error.strerror}. Name a file in a folder that exists and is"
+            " yours to write."
+        ) from None
+    stream = rr.RecordingStream(APPLICATION)
+    stream.set_sinks(rr.FileSink(str(path)))
+    StepLogger(stream, ViewerOptions(detail=True)).log_trainings(frame, trainings)
+    stream.flush()
+    stream.disconnect()
 
 
 # Where it goes
