@@ -73,7 +73,8 @@ class Case:
             return np.full(self.frame.shape, np.inf, np.float32)
         nearest = nearest_sample(valid)
         rows, columns = np.indices(self.frame.shape)
-        return np.hypot(nearest[..., 0] - columns, nearest[..., 1] - rows).astype(np.float32)
+        gap = np.hypot(nearest[..., 0] - columns, nearest[..., 1] - rows)
+        return np.asarray(gap, dtype=np.float32)
 
     @cached_property
     def open(self) -> npt.NDArray[np.bool_]:

@@ -134,7 +134,8 @@ def acquire(
     plan = score.plan(samples, threads)
     lattice_uv = seeds.lattice_uv.reshape(-1, 2)
     lattice_mm = seeds.depth_mm.ravel()
-    uv, depth, made = [lattice_uv], [lattice_mm.astype(np.uint16)], []
+    uv, depth = [lattice_uv], [lattice_mm.astype(np.uint16)]
+    made: list[Round] = []
     for number in range(rounds):
         due = shots * (number + 1) // rounds - sum(r.shots for r in made)
         new_uv = plan.best(due)

@@ -13,7 +13,6 @@ that share one vertex at infinity, `GHOST`, so that a point outside is inserted 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +31,7 @@ Int32Array = npt.NDArray[np.int32]
 def _orient(uv: Int32Array, a: int, b: int, c: int) -> int:
     """Twice the signed area of the triangle a, b, c: positive if c is on the left of ab."""
     au, av = np.int64(uv[a, 0]), np.int64(uv[a, 1])
-    return (uv[b, 0] - au) * (uv[c, 1] - av) - (uv[c, 0] - au) * (uv[b, 1] - av)
+    return int((uv[b, 0] - au) * (uv[c, 1] - av) - (uv[c, 0] - au) * (uv[b, 1] - av))
 
 
 @njit(cache=True, nogil=True)
@@ -48,16 +47,17 @@ def _in_disk(uv: Int32Array, a: int, b: int, c: int, p: int) -> bool:
         if side != 0:
             return side > 0
         pu, pv = np.int64(uv[p, 0]), np.int64(uv[p, 1])
-        return (uv[a, 0] - pu) * (uv[b, 0] - pu) + (uv[a, 1] - pv) * (uv[b, 1] - pv) < 0
+        return bool((uv[a, 0] - pu) * (uv[b, 0] - pu) + (uv[a, 1] - pv) * (uv[b, 1] - pv) < 0)
     pu, pv = np.int64(uv[p, 0]), np.int64(uv[p, 1])
     au, av = uv[a, 0] - pu, uv[a, 1] - pv
     bu, bv = uv[b, 0] - pu, uv[b, 1] - pv
     cu, cv = uv[c, 0] - pu, uv[c, 1] - pv
-    return (
+    return bool(
         (au * au + av * av) * (bu * cv - cu * bv)
         - (bu * bu + bv * bv) * (au * cv - cu * av)
         + (cu * cu + cv * cv) * (au * bv - bu * av)
-    ) > 0
+        > 0
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -315,4 +315,5 @@ class Mesh:
     def real_triangles(self) -> Int32Array:
         """Vertices of the triangles inside the hull, shape (t, 3)."""
         tri = self.tri[: self.triangles]
-        return tri[(tri != GHOST).all(axis=1)]
+        real: Int32Array = tri[(tri != GHOST).all(axis=1)]
+        return real

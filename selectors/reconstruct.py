@@ -22,7 +22,7 @@ STEP_MM = 50.0
 BRIDGE_PX = 10.0
 """Edge length above which such a triangle is one, pixels."""
 
-_FAR = np.int32(1 << 20)  # farther than any row of any image, and its square fits in 64 bits
+_FAR = 1 << 20  # farther than any row of any image, and its square fits in 64 bits
 
 
 @njit(cache=True, nogil=True)
@@ -201,7 +201,6 @@ def reconstruct(
     ValueError
         If the shapes do not fit together or a pixel lies outside the image.
     """
-    height, width = shape
     samples_mm = samples_image(uv, depth_mm, shape)
     valid = samples_mm > 0
     if not valid.any():
@@ -217,7 +216,7 @@ def reconstruct(
         lambda first, end: _draw_triangles(
             kept_uv, kept_mm, triangles, STEP_MM, BRIDGE_PX, out_mm, first, end
         ),
-        height,
+        shape[0],
         threads,
     )
     return out_mm

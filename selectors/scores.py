@@ -32,6 +32,13 @@ assert VOTE_PX < TILE_PX
 
 Image = npt.NDArray[np.float32]
 
+# Position of the lowest set bit of a word: multiplied by a de Bruijn sequence, each single bit
+# leaves another number in the top six bits.
+_DE_BRUIJN = np.uint64(0x03F79D71B4CB0A89)
+_BIT_OF = np.zeros(64, np.int64)
+for _bit in range(64):
+    _BIT_OF[((1 << _bit) * int(_DE_BRUIJN) & (2**64 - 1)) >> 58] = _bit
+
 
 class Plan(ABC):
     """An acquisition under way: says, round after round, which pixels to measure next."""
@@ -120,31 +127,28 @@ def _score_tiles(
                     if shift > 0:
                         window |= bits[y, word + 1] << (np.uint64(64) - shift)
                     window &= (one << np.uint64(2 * half + 1)) - one
-                    du = -half
                     while window:
-                        if not window & one:
-                            window >>= one
-                            du += 1
+                        lowest = window & (~window + one)
+                        window ^= lowest
+                        du = _BIT_OF[(lowest * _DE_BRUIJN) >> np.uint64(58)] - half
+                        d = du * du + dv * dv
+                        if d > farthest:
                             continue
                         z = image_mm[y, u + du]
-                        d = du * du + dv * dv
-                        if d <= farthest:
-                            if z < 0:
-                                missed_sq[missed] = d
-                                missed += 1
-                            elif found < voters or d < farthest:
-                                at = min(found, voters - 1)
-                                while at > 0 and near_sq[at - 1] > d:
-                                    near_sq[at] = near_sq[at - 1]
-                                    near_mm[at] = near_mm[at - 1]
-                                    at -= 1
-                                near_sq[at] = d
-                                near_mm[at] = z
-                                found = min(found + 1, voters)
-                                if found == voters:
-                                    farthest = near_sq[voters - 1]
-                        window >>= one
-                        du += 1
+                        if z < 0:
+                            missed_sq[missed] = d
+                            missed += 1
+                        elif found < voters or d < farthest:
+                            at = min(found, voters - 1)
+                            while at > 0 and near_sq[at - 1] > d:
+                                near_sq[at] = near_sq[at - 1]
+                                near_mm[at] = near_mm[at - 1]
+                                at -= 1
+                            near_sq[at] = d
+                            near_mm[at] = z
+                            found = min(found + 1, voters)
+                            if found == voters:
+                                farthest = near_sq[voters - 1]
                 if found == 0 or near_sq[0] > reach_sq:
                     continue
                 returned = np.float32(0)
@@ -163,7 +167,9 @@ def _score_tiles(
                         all_weight += weight_of[missed_sq[i]]
                 gap = (length_of[near_sq[0]] + length_of[near_sq[min(1, found - 1)]]) / 2
                 score[v, u] = (
-                    (spread / returned + noise_mm2) * (returned / all_weight) * min(gap, gap_px)
+                    (spread / returned + noise_mm2)
+                    * np.sqrt(returned / all_weight)
+                    * min(gap, gap_px)
                 )
 
 
@@ -196,11 +202,12 @@ def _tables(falloff: float) -> tuple[Image, Image, npt.NDArray[np.int64]]:
 class StepScore(Score):
     """The project's own score: expected squared error, times how far a shot reaches.
 
-    ``P(return) * (sum_k w_k (z_k - mean)^2 / sum_k w_k + noise^2) * gap`` over the nearest
+    ``sqrt(P(return)) * (sum_k w_k (z_k - mean)^2 / sum_k w_k + noise^2) * gap`` over the nearest
     samples that returned depth. ``w = 1 / (distance^falloff + 1)``; `mean` is their weighted
     mean; `gap` is the mean distance of the two nearest, at most `gap_px`; ``P(return)`` is the
-    share of their weight in that of all shots as near. Chosen on the `livingroom` and `tabletop`
-    frames; figures in ``app/docs/evaluation.md``.
+    share of their weight in that of all shots as near, and its root because even a shot that
+    misses tells where the hole ends. Chosen on the `livingroom` and `tabletop` frames; figures
+    in ``app/docs/evaluation.md``.
 
     Parameters
     ----------
@@ -291,7 +298,7 @@ class _StepPlan(Plan):
             self._rule._score(samples, due, self._map, self._threads)
             self._current |= wanted
             chosen, worst = best_pixels(
-                self._map, np.flatnonzero(wanted), shots, least, self._current, self._threads
+                self._map, np.flatnonzero(wanted), shots, float(least), self._current, self._threads
             )
             if len(chosen) == shots or least <= 0:
                 self._threshold = worst
