@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 from selective_depth.drivers.frame import DepthArray, DepthFrame
 from selective_depth.drivers.openni_list import DeviceInfo
@@ -145,7 +145,10 @@ class OpenNIDevice(DepthSource):
         started = time.monotonic()
         self._worker, about = self._open(_OPEN_S, None)
         self._reopen_s = max(_REOPEN_S, 2 * (time.monotonic() - started))
-        self.camera = camera_of(about)
+        camera = camera_of(about)
+        if self.settings.mirror:
+            camera = replace(camera, cx=camera.width - 1 - camera.cx)
+        self.camera = camera
         self.fps = float(about["fps"])
         self._supervisor = threading.Thread(
             target=self._supervise, name="openni-supervisor", daemon=True

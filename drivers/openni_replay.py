@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
-from typing import TypeVar
 
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni_file import inspect_oni
@@ -13,13 +11,12 @@ from selective_depth.drivers.source import (
     DamagedRecordingError,
     DepthSource,
     SourceEndedError,
+    SourceError,
     SourceTimeoutError,
 )
 
 _OPEN_S = 10.0  # opening takes milliseconds; beyond this it hangs
 _SILENT_S = 8.0  # the worker itself gives up on a silent file after 5 s
-
-_Over = TypeVar("_Over", SourceEndedError, DamagedRecordingError)
 
 
 class OpenNIRecording(DepthSource):
@@ -51,7 +48,11 @@ class OpenNIRecording(DepthSource):
         readable, self._flaw = _readable_frames(self.uri)
         self._worker: Worker | None = Worker("recording", path=self.uri, readable=readable)
         self._read_count = 0
-        self._ended: SourceEndedError | DamagedRecordingError | None = None
+        self._unheard_s = 0.0
+        self._end: tuple[type[SourceError], str] = (
+            SourceEndedError,
+            f"'{self.uri}' has been closed.",
+        )
         try:
             about = self._receive(_OPEN_S)
             if about is None:
@@ -62,7 +63,6 @@ class OpenNIRecording(DepthSource):
             raise
         self.fps = float(about["fps"])
         self.frame_count = int(about["frames"])
-        self._heard = time.monotonic()
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         """Return the next frame of the recording.
@@ -81,32 +81,23 @@ class OpenNIRecording(DepthSource):
         SourceTimeoutError
             If the frame did not come in time; the next call goes on waiting for it.
         """
-        if self._ended is not None:
-            raise self._ended
         if self._worker is None:
-            raise SourceEndedError(f"'{self.uri}' has been closed.")
+            kind, words = self._end
+            raise kind(words)
         message = self._receive(timeout_s)
         if message is None:
-            if time.monotonic() - self._heard < _SILENT_S:
+            self._unheard_s += timeout_s
+            if self._unheard_s < _SILENT_S:
                 raise SourceTimeoutError(
                     f"'{self.uri}' gave no frame {self._read_count + 1} within {timeout_s:g} s."
                 )
-            raise self._over(
-                DamagedRecordingError(
-                    f"'{self.uri}' cannot be read beyond frame {self._read_count} of"
-                    f" {self.frame_count}: OpenNI2 hangs on it."
-                )
-            )
-        self._heard = time.monotonic()
+            raise self._over(DamagedRecordingError, f"{self._so_far()}: OpenNI2 hangs on it.")
+        self._unheard_s = 0.0
         if message["kind"] == "end" and self._flaw:
-            raise self._over(
-                DamagedRecordingError(
-                    f"'{self.uri}' cannot be read beyond frame {self._read_count}: {self._flaw}"
-                )
-            )
+            raise self._over(DamagedRecordingError, f"{self._so_far()}: {self._flaw}")
         if message["kind"] == "end":
             raise self._over(
-                SourceEndedError(f"'{self.uri}' has ended after {self._read_count} frames.")
+                SourceEndedError, f"'{self.uri}' has ended after {self._read_count} frames."
             )
         frame = DepthFrame(
             depth_mm=self._worker.take(message, self.camera.width, self.camera.height),
@@ -129,20 +120,25 @@ class OpenNIRecording(DepthSource):
         message = self._worker.receive(timeout_s)
         if message is not None and message["kind"] == "error":
             error = error_of(message)
-            raise self._over(error) if isinstance(error, DamagedRecordingError) else error
+            raise self._over(type(error), str(error))
         if message is not None and message["kind"] == "died":
             raise self._over(
-                DamagedRecordingError(
-                    f"'{self.uri}' cannot be read beyond frame {self._read_count}:"
-                    f" {message['reason']}. `selective-depth check` says what can be saved."
-                )
+                DamagedRecordingError,
+                f"{self._so_far()}: {message['reason']}. `selective-depth check` says what can be"
+                " saved.",
             )
         return message
 
-    def _over(self, error: _Over) -> _Over:
-        self._ended = error
+    def _so_far(self) -> str:
+        return f"'{self.uri}' cannot be read beyond frame {self._read_count}"
+
+    def _over(self, kind: type[SourceError], words: str) -> SourceError:
+        """End it for good. The error is made anew for each reader: one that is kept would keep
+        its traceback, and with it the last frame.
+        """
+        self._end = kind, words
         self.close()
-        return error
+        return kind(words)
 
 
 def _readable_frames(path: str) -> tuple[int, str]:

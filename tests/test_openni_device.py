@@ -120,6 +120,7 @@ def test_a_sensor_that_does_not_know_its_field_of_view(virtual_sensor: VirtualSe
 def test_mirrored_where_asked(virtual_sensor: VirtualSensor) -> None:
     with OpenNIDevice(settings=DeviceSettings(mirror=True)) as device:
         depth_mm = device.read().depth_mm
+        assert device.camera.cx == 319
     assert depth_mm[0, 0] + 1000 == depth_mm[0, -1]
 
 

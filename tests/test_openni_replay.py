@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import subprocess
 import sys
 import threading
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -173,6 +175,16 @@ def test_without_the_runtime_it_says_what_to_install(
     monkeypatch.setenv("OPENNI2_REDIST", str(tmp_path))
     with pytest.raises(RuntimeMissingError, match="libopenni2-0"):
         OpenNIRecording(oni_sample.path)
+
+
+def test_a_recording_that_is_over_keeps_no_frame(oni_sample: OniSample) -> None:
+    gc.disable()
+    try:
+        recording = OpenNIRecording(oni_sample.path)
+        last = [weakref.ref(frame.depth_mm) for frame in recording][-1]
+        assert last() is None
+    finally:
+        gc.enable()
 
 
 @pytest.mark.slow
