@@ -387,6 +387,69 @@ def bench(
     run_bench(source or bundled_recording(), frames, json=json, page=page, peers=peers)
 
 
+@command(
+    "Compare",
+    (f"{PROGRAM} evaluate frames/", "every strategy on every 20th frame"),
+    (
+        f"{PROGRAM} evaluate frames/ --budget 0.05 0.10 --json out.json --picture out.png",
+        "with a file of all figures and a picture",
+    ),
+    (f"{PROGRAM} evaluate 'virtual:workstation?noise=off'", "where the truth is exact"),
+)
+def evaluate(
+    sources: Annotated[tuple[str, ...], arg(metavar="SOURCE...")],
+    /,
+    every: Annotated[int, arg(metavar="N")] = 20,
+    frames: Annotated[int | None, arg(metavar="N")] = None,
+    budget: Annotated[tuple[float, ...], arg(metavar="SHARE...")] = (0.05, 0.10),
+    rounds: Annotated[int, arg(metavar="N")] = 8,
+    seeds: SeedOptions = DEFAULTS.seeds,
+    random_seeds: Annotated[int, arg(metavar="N")] = 3,
+    jobs: Annotated[int | None, arg(metavar="N")] = None,
+    json: Annotated[Path | None, arg(metavar="FILE")] = None,
+    picture: Annotated[Path | None, arg(metavar="FILE.png")] = None,
+) -> None:
+    """Compare ways of choosing measurements: how good a model does a budget buy?
+
+    Parameters
+    ----------
+    sources : tuple of str
+        Recordings, folders or scenes, as for replay.
+    every : int
+        Take every N-th frame.
+    frames : int
+        Take at most N frames of each source.
+    budget : tuple of float
+        Further measurements as shares of the frame's pixels.
+    rounds : int
+        Rounds of the closed loops.
+    seeds
+        The seed lattice.
+    random_seeds : int
+        How often strategies that draw at random are run.
+    jobs : int
+        Processes; by default one per processor.
+    json : Path
+        Write the figures to a file as well.
+    picture : Path
+        Write where each strategy shot and how wrong its model is, for the first frame.
+    """
+    from selective_depth.app.evaluate_report import run_evaluation
+
+    run_evaluation(
+        sources,
+        every=every,
+        frames=frames,
+        budgets=budget,
+        rounds=rounds,
+        seeds_shape=(seeds.rows, seeds.columns),
+        random_seeds=random_seeds,
+        jobs=jobs,
+        json_file=json,
+        picture=picture,
+    )
+
+
 def run(arguments: Sequence[str]) -> int:
     """Run a command line and return its exit code: 0, 1 failed, 2 misused, 130 interrupted."""
     words = list(arguments)
