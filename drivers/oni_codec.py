@@ -30,10 +30,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-CODEC_TABLE: Final = b"16zT"
-CODEC_PLAIN: Final = b"16zP"
-CODEC_NONE: Final = b"NONE"
-DEPTH_CODECS: Final = (CODEC_TABLE, CODEC_PLAIN, CODEC_NONE)
+from selective_depth.drivers.oni_records import CODEC_NONE, CODEC_TABLE
 
 MAX_DISTINCT: Final = 32768
 """Ranks have 15 bits, so that many different depths fit into one frame."""
@@ -48,7 +45,7 @@ def decode_depth(codec: bytes, payload: bytes, height: int, width: int) -> _Dept
     Parameters
     ----------
     codec : bytes
-        One of `DEPTH_CODECS`.
+        One of `oni_records.DEPTH_CODECS`.
     payload : bytes
         The compressed frame.
     height, width : int

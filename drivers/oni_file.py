@@ -16,9 +16,11 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from selective_depth.drivers.frame import Camera
-from selective_depth.drivers.oni_codec import CODEC_TABLE, DEPTH_CODECS, decode_depth, mend_order
 from selective_depth.drivers.oni_records import (
     BEGIN_FIELDS,
+    CODEC_TABLE,
+    CODECS,
+    DEPTH_CODECS,
     FILE_HEADER,
     FRAME_FIELDS,
     IDENTITY,
@@ -48,7 +50,6 @@ from selective_depth.drivers.oni_report import (
 )
 from selective_depth.drivers.source import DamagedRecordingError, SourceNotFoundError
 
-CODECS: Final = frozenset((*DEPTH_CODECS, b"JPEG", b"Im8z"))
 _MAX_NODES: Final = 64
 _MILLIMETRES: Final = 100
 """OpenNI2's number of the pixel format "depth in millimetres"."""
@@ -434,6 +435,9 @@ class _Inspection:
 
         Returns how many can, and how many of these the recorder swapped the last pixels of.
         """
+        # Compiled code, whose import takes longer than a whole check without it.
+        from selective_depth.drivers.oni_codec import decode_depth, mend_order
+
         decoded, swapped, sound = 0, 0, []
         size = camera.height, camera.width
         for frame in node.frames:

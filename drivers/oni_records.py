@@ -21,6 +21,13 @@ VERSION: Final = (1, 0, 1, 0)
 OLDEST_VERSION: Final = (1, 0, 0, 4)
 MAGIC: Final = b"NIR\0"
 
+CODEC_TABLE: Final = b"16zT"
+CODEC_PLAIN: Final = b"16zP"
+CODEC_NONE: Final = b"NONE"
+DEPTH_CODECS: Final = (CODEC_TABLE, CODEC_PLAIN, CODEC_NONE)
+CODECS: Final = frozenset((*DEPTH_CODECS, b"JPEG", b"Im8z"))
+"""Every compression that OpenNI2's player knows."""
+
 FILE_HEADER: Final = struct.Struct("<4sBBHIQI")
 """Identity, version (four numbers), latest timestamp in microseconds, highest node number."""
 HEADER: Final = struct.Struct("<4sIIIIQ")

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.oni_codec import CODEC_TABLE, decode_depth, mend_order
-from selective_depth.drivers.oni_file import CODECS, inspect_oni, open_regular, read_payload
-from selective_depth.drivers.oni_records import NodeAddition
+from selective_depth.drivers.oni_codec import decode_depth, mend_order
+from selective_depth.drivers.oni_file import inspect_oni, open_regular, read_payload
+from selective_depth.drivers.oni_records import CODEC_TABLE, CODECS, NodeAddition
 from selective_depth.drivers.oni_report import OniFrame, OniReport
 from selective_depth.drivers.oni_writer import RecordWriter, depth_properties
 from selective_depth.drivers.recorded import FolderWriter

@@ -11,9 +11,10 @@ from types import TracebackType
 from typing import BinaryIO, Final, Self
 
 from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.drivers.oni_codec import CODEC_TABLE, encode_depth
+from selective_depth.drivers.oni_codec import encode_depth
 from selective_depth.drivers.oni_records import (
     BEGIN_FIELDS,
+    CODEC_TABLE,
     FILE_HEADER,
     FRAME_FIELDS,
     IDENTITY,

@@ -9,13 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from selective_depth.drivers.oni_codec import (
-    CODEC_NONE,
-    CODEC_PLAIN,
-    CODEC_TABLE,
-    decode_depth,
-    encode_depth,
-)
+from selective_depth.drivers.oni_codec import decode_depth, encode_depth
+from selective_depth.drivers.oni_records import CODEC_NONE, CODEC_PLAIN, CODEC_TABLE
 
 Depth = npt.NDArray[np.uint16]
 

@@ -18,11 +18,13 @@ from raw_oni_player import digest_of, play_all
 from virtual_sensor import record_oni
 
 from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.drivers.oni_codec import CODEC_NONE, CODEC_TABLE, encode_depth
+from selective_depth.drivers.oni_codec import encode_depth
 from selective_depth.drivers.oni_file import inspect_oni
 from selective_depth.drivers.oni_reader import OniReader
 from selective_depth.drivers.oni_records import (
     BEGIN_FIELDS,
+    CODEC_NONE,
+    CODEC_TABLE,
     FILE_HEADER,
     FRAME_FIELDS,
     HEADER,
