@@ -88,7 +88,8 @@ class ImprovementSelector:
         """Map the improvement over the whole frame and select its best pixels."""
         windows = windows_of(seeds, self.exponent)
         shape = seeds.frame_shape
-        maps = tuple(np.empty(shape, np.float32) for _ in range(4))
+        # One block: the allocator keeps it for the next frame instead of returning its pages.
+        maps = np.empty((4, *shape), np.float32)
         estimate, variance, raw, score = maps
         known = np.empty(shape, np.bool_)
         padded = np.pad(np.asarray(seeds.depth_mm, np.float32), 1)
@@ -101,7 +102,7 @@ class ImprovementSelector:
             histograms.append(histogram)
             improvement_rows(
                 first_row, end_row, padded, half, *windows.kernel_arguments, _scratch(windows),
-                histogram, (*maps, known),
+                histogram, (estimate, variance, raw, score, known),
             )  # fmt: skip
 
         in_bands(band, shape[0], self.threads)
@@ -131,5 +132,6 @@ def _scratch(windows: Windows) -> tuple[object, ...]:
         np.zeros((2, 3, tallest, widest, batches, LANES), np.float32),
         np.zeros((2, batches, LANES), np.float32),
         np.zeros((3, widest, batches * LANES), np.float32),
-        np.zeros(batches * LANES, np.float32),
+        np.zeros((3, batches * LANES), np.float32),
+        np.zeros(len(columns.centres) + 1, np.uint8),
     )

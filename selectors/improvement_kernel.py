@@ -11,7 +11,7 @@ from selective_depth.selectors.lattice_tables import SEEDS
 from selective_depth.selectors.semivariogram import fit_samples
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, forceinline=True, nogil=True)
 def gather_seeds(padded, rows, columns, i, j, samples):  # type: ignore[no-untyped-def]
     """Collect the seeds of the window about lattice point (i, j), the centre first.
 
@@ -45,7 +45,7 @@ def gather_seeds(padded, rows, columns, i, j, samples):  # type: ignore[no-untyp
 
 @njit(cache=True, nogil=True)
 def krige_row(  # type: ignore[no-untyped-def]
-    i, padded, row_axis, column_axis, order, tables, power, frame_shape, samples, lattice_scratch,
+    i, padded, row_axis, column_axis, order, tables, frame_shape, samples, lattice_scratch,
     window_scratch, strip, held,
 ):  # fmt: skip
     """Krige all windows of one lattice row.
@@ -60,11 +60,11 @@ def krige_row(  # type: ignore[no-untyped-def]
     rows, ups, downs, row_shapes = row_axis
     columns, lefts, rights, column_shapes = column_axis
     lanes_columns, shape_of, place = order
-    first_pixel, distances = tables[0], tables[2]
+    first_pixel, distances, between = tables[0], tables[2], tables[3]
     column_shape_count = len(first_pixel) // (row_shapes.max() + 1)
     up, down = ups[i], downs[i]
     height = up + down - 1
-    u, v, z, _ = samples
+    z, row_of = samples[2], samples[3]
     for j in range(len(columns)):
         count = 0
         for k in range(SEEDS):
@@ -89,11 +89,11 @@ def krige_row(  # type: ignore[no-untyped-def]
             strip[:, :height, :width, batch, lane] = 0
             continue
         gathered = gather_seeds(padded, rows, columns, i, j, samples)
-        a, b = fit_samples(u, v, z, gathered, power)
-        first = first_pixel[row_shapes[i] * column_shape_count + column_shapes[j]]
+        geometry = row_shapes[i] * column_shape_count + column_shapes[j]
+        a, b = fit_samples(z, row_of, gathered, between[geometry])
         krige_window(
-            samples, gathered, a, b, power, distances, first, columns[j] - lefts[j] + 1,
-            rows[i] - up + 1, width, height, frame_shape, window_scratch,
+            samples, gathered, a, b, between[geometry], distances, first_pixel[geometry],
+            columns[j] - lefts[j] + 1, rows[i] - up + 1, width, height, frame_shape, window_scratch,
         )  # fmt: skip
         for row in range(height):
             for column in range(width):
@@ -103,19 +103,30 @@ def krige_row(  # type: ignore[no-untyped-def]
                 strip[2, row, column, batch, lane] = window_scratch[2][p]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def blend_down(share_one, one, held_one, share_other, other, held_other, mixed, held):  # type: ignore[no-untyped-def]
-    """Blend the same pixel row of two lattice rows' windows, weighted; place by place."""
-    for k in range(len(held)):
-        held[k] = share_one * held_one[k] + share_other * held_other[k]
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def blend_down(
+    share_one, one, row_one, held_one, share_other, other, row_other, held_other, mixed, held
+):  # type: ignore[no-untyped-def]
+    """Blend the same pixel row of two lattice rows' windows, weighted; place by place.
+
+    `held` has three rows: the weight in all, and that of either window.
+    """
+    total, weight_one, weight_other = held[0], held[1], held[2]
+    for k in range(len(total)):
+        weight_one[k] = share_one * held_one[k]
+    for k in range(len(total)):
+        weight_other[k] = share_other * held_other[k]
+    for k in range(len(total)):
+        total[k] = weight_one[k] + weight_other[k]
     for q in range(mixed.shape[0]):
         for column in range(mixed.shape[1]):
-            into, here, there = mixed[q, column], one[q, column], other[q, column]
-            for k in range(len(held)):
-                into[k] = share_one * held_one[k] * here[k] + share_other * held_other[k] * there[k]
+            into = mixed[q, column]
+            here, there = one[q, row_one, column], other[q, row_other, column]
+            for k in range(len(total)):
+                into[k] = weight_one[k] * here[k] + weight_other[k] * there[k]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def blend_across(column_blend, places, mixed, held, estimate, variance, raw):  # type: ignore[no-untyped-def]
     """Blend one pixel row across from the windows left and right of each pixel."""
     _, _, _, _, first_weight, second_weight = column_blend
@@ -132,52 +143,75 @@ def blend_across(column_blend, places, mixed, held, estimate, variance, raw):  #
         raw[x] = one * flat_raw[j] + other * flat_raw[k]
 
 
-@njit(cache=True, nogil=True)
+FAR, NEAR, MIXED = 0, 1, 2
+
+
+@njit(cache=True, forceinline=True, nogil=True)
+def judge_cells(i, padded, rows, columns, reach_squared, state):  # type: ignore[no-untyped-def]
+    """Judge the cells between lattice rows i and i + 1: known, unknown, or to be looked at.
+
+    Cell j lies between lattice columns j - 1 and j. A seed that returned depth makes known
+    what lies within reach of it; seeds two lattice steps away or farther are not asked.
+    """
+    height = rows[i + 1] - rows[i] if 0 <= i < len(rows) - 1 else -1
+    for j in range(len(columns) + 1):
+        width = columns[j] - columns[j - 1] if 0 < j < len(columns) else -1
+        # At the frame's edge a cell has no far side: look at its pixels one by one.
+        small = height >= 0 and width >= 0 and height**2 + width**2 <= reach_squared
+        corners = 0
+        for k in range(4):
+            corners += padded[i + 1 + k // 2, j + k % 2] > 0
+        # Every window that a pixel here lies in holds all corners; a system takes two samples.
+        state[j] = NEAR if corners >= 2 and small else MIXED
+        if corners == 0:
+            top, bottom = max(i, 0), min(i + 4, padded.shape[0])
+            start, end = max(j - 1, 0), min(j + 3, padded.shape[1])
+            if not (padded[top:bottom, start:end] > 0).any():
+                state[j] = FAR
+
+
+@njit(cache=True, forceinline=True, nogil=True)
 def near_seed(padded, rows, columns, i, j, y, x, reach_squared):  # type: ignore[no-untyped-def]
-    """Whether any of the 4x4 seeds around cell (i, j) returned depth near pixel (y, x)."""
+    """Whether any of the 4x4 seeds around cell j below lattice row i is near pixel (y, x)."""
     for ni in range(max(i - 1, 0), min(i + 3, len(rows))):
         dy = rows[ni] - y
-        for nj in range(max(j - 1, 0), min(j + 3, len(columns))):
+        for nj in range(max(j - 2, 0), min(j + 2, len(columns))):
             dx = columns[nj] - x
             if padded[ni + 1, nj + 1] > 0 and dx * dx + dy * dy <= reach_squared:
                 return True
     return False
 
 
-@njit(cache=True, nogil=True)
-def mark_unknown(  # type: ignore[no-untyped-def]
-    y, i, padded, rows, columns, column_blend, places, reach_squared, held, estimate, variance,
-    raw, known,
+@njit(cache=True, forceinline=True, nogil=True)
+def mark_known(  # type: ignore[no-untyped-def]
+    y, i, padded, rows, columns, column_blend, places, reach_squared, held, state, estimate,
+    variance, raw, known,
 ):  # fmt: skip
-    """Tell known pixels of a row from those too far from every seed, and clear the latter.
-
-    `i` is the lattice row at or above pixel row `y`, -1 above the first.
-    """
+    """Tell known pixels of a row from those too far from every seed, and clear the latter."""
     _, _, _, _, first_weight, second_weight = column_blend
     first_place, second_place = places[0], places[1]
-    for j in range(-1, len(columns)):
-        start = columns[j] if j >= 0 else 0
-        end = columns[j + 1] if j + 1 < len(columns) else len(known)
-        # The padded rim is missing, so cells at the edge are never taken as whole.
-        whole = padded[i + 1, j + 1] > 0 and padded[i + 1, j + 2] > 0
-        whole = whole and padded[i + 2, j + 1] > 0 and padded[i + 2, j + 2] > 0
+    known[:] = True
+    for j in range(len(columns) + 1):
+        if state[j] == NEAR:
+            continue
+        start = columns[j - 1] if j > 0 else 0
+        end = columns[j] if j < len(columns) else len(known)
         for x in range(start, end):
-            near = whole
-            if not whole:
+            if state[j] == MIXED:
                 total = first_weight[x] * held[first_place[x]]
                 total += second_weight[x] * held[second_place[x]]
-                near = total > 0 and near_seed(padded, rows, columns, i, j, y, x, reach_squared)
-                if not near:
-                    estimate[x] = np.nan
-                    variance[x] = np.nan
-                    raw[x] = 0
-            known[x] = near
+                if total > 0 and near_seed(padded, rows, columns, i, j, y, x, reach_squared):
+                    continue
+            known[x] = False
+            estimate[x] = np.nan
+            variance[x] = np.nan
+            raw[x] = 0
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def improvement_rows(  # type: ignore[no-untyped-def]
     first_row, end_row, padded, half, row_axis, column_axis, row_blend, column_blend, order,
-    places, tables, power, reach_squared, scratch, histogram, out,
+    places, tables, reach_squared, scratch, histogram, out,
 ):  # fmt: skip
     """Map the pixel rows `first_row` to `end_row` - 1 of a frame.
 
@@ -191,30 +225,34 @@ def improvement_rows(  # type: ignore[no-untyped-def]
         Estimate, variance, improvement, score and known of the frame.
     """
     estimate, variance, raw, score, known = out
-    samples, lattice_scratch, window_scratch, strips, helds, mixed, held = scratch
+    samples, lattice_scratch, window_scratch, strips, helds, mixed, held, state = scratch
     frame_shape = estimate.shape
     rows, columns = row_axis[0], column_axis[0]
     y_first, y_second, y_first_at, y_second_at, y_first_weight, y_second_weight = row_blend
     flat = strips.reshape((2, 3, strips.shape[2], strips.shape[3], -1))
     flat_held = helds.reshape((2, -1))
     ready = -1
+    judged = -2
     for y in range(first_row, end_row):
         i, k = y_first[y], y_second[y]
         # Lattice row n is kept in slot n % 2 as long as it is needed.
         for n in range(max(ready + 1, i), k + 1):
             krige_row(
-                n, padded, row_axis, column_axis, order, tables, power, frame_shape, samples,
+                n, padded, row_axis, column_axis, order, tables, frame_shape, samples,
                 lattice_scratch, window_scratch, strips[n % 2], helds[n % 2],
             )  # fmt: skip
             ready = n
         blend_down(
-            y_first_weight[y], flat[i % 2, :, y_first_at[y]], flat_held[i % 2],
-            y_second_weight[y], flat[k % 2, :, y_second_at[y]], flat_held[k % 2], mixed, held,
+            y_first_weight[y], flat[i % 2], y_first_at[y], flat_held[i % 2],
+            y_second_weight[y], flat[k % 2], y_second_at[y], flat_held[k % 2], mixed, held,
         )  # fmt: skip
-        blend_across(column_blend, places, mixed, held, estimate[y], variance[y], raw[y])
+        blend_across(column_blend, places, mixed, held[0], estimate[y], variance[y], raw[y])
         above = i if rows[i] <= y else -1
-        mark_unknown(
-            y, above, padded, rows, columns, column_blend, places, reach_squared, held,
+        if judged != above:
+            judge_cells(above, padded, rows, columns, reach_squared, state)
+            judged = above
+        mark_known(
+            y, above, padded, rows, columns, column_blend, places, reach_squared, held[0], state,
             estimate[y], variance[y], raw[y], known[y],
         )  # fmt: skip
         for x in range(frame_shape[1]):

@@ -140,7 +140,7 @@ def _spiral(reach: int) -> npt.NDArray[np.int64]:
     return np.stack((dv[order], du[order]), axis=1).astype(np.int64)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, forceinline=True, nogil=True)
 def _gather(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
     measured, spiral, row, column, up, down, left, right, samples
 ):
@@ -163,7 +163,7 @@ def _gather(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, forceinline=True, nogil=True)
 def _near_sample(measured, spiral, y, x, reach_squared):  # type: ignore[no-untyped-def] # pragma: no cover
     height, width = measured.shape
     for n in range(len(spiral)):
@@ -181,7 +181,8 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
     reach_squared, samples, distances, scratch, sums, held, out,
 ):  # fmt: skip
     estimate, variance, raw, known = out
-    u, v, z, _ = samples
+    u, v, z, row_of = samples
+    between = np.zeros((MAX_SAMPLES, MAX_SAMPLES))
     reach = power.shape[0] // 2
     frame_width = measured.shape[1]
     for i in range(len(rows)):
@@ -200,7 +201,10 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
             # One sample alone says nothing of how depth varies around it.
             if count < 2:
                 continue
-            a, b = fit_samples(u, v, z, count, power)
+            for n in range(count):
+                for k in range(count):
+                    between[n, k] = power[reach + v[n] - v[k], reach + u[n] - u[k]]
+            a, b = fit_samples(z, row_of, count, between)
             width, height = end - start, bottom - top
             for n in range(count):
                 p = 0
@@ -210,7 +214,7 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
                         distances[n, p] = line[reach + x - u[n]]
                         p += 1
             krige_window(
-                samples, count, a, b, power, distances, 0, start, top, width, height,
+                samples, count, a, b, between, distances, 0, start, top, width, height,
                 measured.shape, scratch,
             )  # fmt: skip
             for y in range(y0, y1):

@@ -39,9 +39,25 @@ MAX_SAMPLES = 32
 BLOCK = 4
 """Rows of U that one pass over the pixels takes in."""
 
+MAX_PIXELS = 16384
+"""Most pixels in one window, rim included."""
+
+# The rows of U stand this far apart in one array: constant, so that the compiler can see that
+# the rows a loop writes are not those it reads; and one cache line off a power of two.
+_STRIDE = MAX_PIXELS + 304
+
+
+VECTOR = 16
+"""Loops over pixels run to a multiple of this: vector instructions leave no rest to do singly."""
+
+
+def padded_pixels(width: int, height: int) -> int:
+    """Room for a window's pixels, their rim, and what loops run over behind them."""
+    return (width + 2) * (height + 3) + 2 * VECTOR
+
 
 def window_scratch(pixels: int):  # type: ignore[no-untyped-def]
-    """Working memory of `krige_window` for windows of up to `pixels` pixels, rim included.
+    """Working memory of `krige_window` for windows of up to so many `padded_pixels`.
 
     One per thread. The first three arrays hold the results.
     """
@@ -52,9 +68,9 @@ def window_scratch(pixels: int):  # type: ignore[no-untyped-def]
         np.zeros(pixels, np.float32),  # 1 / estimate, 0 where it does not count
         np.zeros(pixels, np.float32),  # covariance with the pixel to the right
         np.zeros(pixels, np.float32),  # covariance with the pixel below
-        np.zeros((MAX_SAMPLES + BLOCK, pixels), np.float32),  # U
+        np.empty(MAX_SAMPLES * _STRIDE, np.float32),  # U
         np.zeros((MAX_SAMPLES, MAX_SAMPLES), np.float64),  # L, its diagonal inverted
-        np.zeros(MAX_SAMPLES + BLOCK, np.float64),  # L^-1 (Z - z_ref)
+        np.zeros(MAX_SAMPLES, np.float64),  # L^-1 (Z - z_ref)
     )
 
 
@@ -64,21 +80,20 @@ def sample_buffers():  # type: ignore[no-untyped-def]
     return whole, whole.copy(), np.zeros(MAX_SAMPLES, np.float32), whole.copy()
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _factor(u, v, z, count, a, b, power, L, y):  # type: ignore[no-untyped-def]
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _factor(z, row_of, count, a, b, between, L, y):  # type: ignore[no-untyped-def]
     """Cholesky factor of the differences to sample 0, and the depths' differences solved by it.
 
     A pivot of nothing (no variation at all) drops its row: that sample adds no knowledge.
     """
-    reach = power.shape[0] // 2
+    to_reference = between[row_of[0]]
     for i in range(count - 1):
-        ui, vi = u[i + 1], v[i + 1]
-        to_i = power[reach + vi - v[0], reach + ui - u[0]]
+        row = between[row_of[i + 1]]
+        to_i = row[row_of[0]]
         residual = np.float64(z[i + 1]) - np.float64(z[0])
         for k in range(i):
-            uk, vk = u[k + 1], v[k + 1]
-            to_k = power[reach + vk - v[0], reach + uk - u[0]]
-            entry = a * (to_i + to_k - power[reach + vi - vk, reach + ui - uk]) + b
+            other = row_of[k + 1]
+            entry = a * (to_i + to_reference[other] - row[other]) + b
             for q in range(k):
                 entry -= L[i, q] * L[k, q]
             entry *= L[k, k]
@@ -92,23 +107,60 @@ def _factor(u, v, z, count, a, b, power, L, y):  # type: ignore[no-untyped-def]
         y[i] = residual * L[i, i]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _subtract_block(block, earlier, rows, k, pixels):  # type: ignore[no-untyped-def]
+    """Take the part of an earlier block of U out of a later one: U -= L U_earlier."""
+    f00, f01, f02, f03 = rows[0, k], rows[0, k + 1], rows[0, k + 2], rows[0, k + 3]
+    f10, f11, f12, f13 = rows[1, k], rows[1, k + 1], rows[1, k + 2], rows[1, k + 3]
+    f20, f21, f22, f23 = rows[2, k], rows[2, k + 1], rows[2, k + 2], rows[2, k + 3]
+    f30, f31, f32, f33 = rows[3, k], rows[3, k + 1], rows[3, k + 2], rows[3, k + 3]
+    g00, g01, g02, g03 = np.float32(f00), np.float32(f01), np.float32(f02), np.float32(f03)
+    g10, g11, g12, g13 = np.float32(f10), np.float32(f11), np.float32(f12), np.float32(f13)
+    g20, g21, g22, g23 = np.float32(f20), np.float32(f21), np.float32(f22), np.float32(f23)
+    g30, g31, g32, g33 = np.float32(f30), np.float32(f31), np.float32(f32), np.float32(f33)
+    for p in range(pixels):
+        e0, e1 = earlier[p], earlier[_STRIDE + p]
+        e2, e3 = earlier[2 * _STRIDE + p], earlier[3 * _STRIDE + p]
+        block[p] -= g00 * e0 + g01 * e1 + g02 * e2 + g03 * e3
+        block[_STRIDE + p] -= g10 * e0 + g11 * e1 + g12 * e2 + g13 * e3
+        block[2 * _STRIDE + p] -= g20 * e0 + g21 * e1 + g22 * e2 + g23 * e3
+        block[3 * _STRIDE + p] -= g30 * e0 + g31 * e1 + g32 * e2 + g33 * e3
+
+
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _solve_block(block, corner, pixels):  # type: ignore[no-untyped-def]
+    """Solve a block of U by its own corner of L, whose diagonal is inverted."""
+    d0, d1, d2 = np.float32(corner[0, 0]), np.float32(corner[1, 1]), np.float32(corner[2, 2])
+    d3, l10, l20 = np.float32(corner[3, 3]), np.float32(corner[1, 0]), np.float32(corner[2, 0])
+    l21, l30 = np.float32(corner[2, 1]), np.float32(corner[3, 0])
+    l31, l32 = np.float32(corner[3, 1]), np.float32(corner[3, 2])
+    for p in range(pixels):
+        r0 = d0 * block[p]
+        r1 = d1 * (block[_STRIDE + p] - l10 * r0)
+        r2 = d2 * (block[2 * _STRIDE + p] - l20 * r0 - l21 * r1)
+        block[3 * _STRIDE + p] = d3 * (block[3 * _STRIDE + p] - l30 * r0 - l31 * r1 - l32 * r2)
+        block[p] = r0
+        block[_STRIDE + p] = r1
+        block[2 * _STRIDE + p] = r2
+
+
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def krige_window(  # type: ignore[no-untyped-def]
-    samples, count, a, b, power, distances, first, u0, v0, width, height, frame_shape, scratch
+    samples, count, a, b, between, distances, first, u0, v0, width, height, frame_shape, scratch
 ):
     """Krige one window; results in the first three arrays of `scratch`.
 
     Parameters
     ----------
     samples : tuple
-        Columns, rows and depths (mm) of the samples and their rows in `distances`; the first
+        Columns, rows and depths (mm) of the samples and their rows in the tables; the first
         `count` hold. Sample 0 is the reference and best stands near the middle.
     a, b : float
         The local semivariogram.
-    power : float64 array
-        `power_table` that reaches from any sample to any other.
+    between : float64 array of shape (rows, rows)
+        Distance^w between samples.
     distances : float32 array of shape (rows, pixels)
-        Distance^w to the window's pixels, from column `first` on.
+        Distance^w to the window's pixels, from column `first` on, `padded_pixels` of them.
     u0, v0, width, height : int
         The window's pixels; results and distances are laid out with a rim of one pixel on
         every side, row by row, `width` + 2 to a row.
@@ -117,93 +169,94 @@ def krige_window(  # type: ignore[no-untyped-def]
     scratch : tuple
         `window_scratch`.
     """
-    u, v, z, row_of = samples
-    estimate, variance, improvement, inverse, right, below, U, L, y = scratch
+    z, row_of = samples[2], samples[3]
+    estimate, variance, _, _, right, below, U, L, y = scratch
     stride = width + 2
-    pixels = stride * (height + 2)
-    inner = pixels - stride
+    pixels = (stride * (height + 2) + VECTOR - 1) // VECTOR * VECTOR
     scale, nugget = np.float32(a), np.float32(b)
-    _factor(u, v, z, count, a, b, power, L, y)
+    _factor(z, row_of, count, a, b, between, L, y)
 
     m = count - 1
-    to_reference = distances[row_of[0], first : first + pixels]
-    for i in range(m):
-        row = U[i]
-        to_sample = distances[row_of[i + 1], first : first + pixels]
-        reach = power.shape[0] // 2
-        constant = np.float32(a * power[reach + v[i + 1] - v[0], reach + u[i + 1] - u[0]] + b)
-        for p in range(pixels):
-            row[p] = constant + scale * (to_reference[p] - to_sample[p])
-        k = 0
-        while k + BLOCK <= i:
-            f0, f1 = np.float32(L[i, k]), np.float32(L[i, k + 1])
-            f2, f3 = np.float32(L[i, k + 2]), np.float32(L[i, k + 3])
-            r0, r1, r2, r3 = U[k], U[k + 1], U[k + 2], U[k + 3]
-            for p in range(pixels):
-                row[p] -= f0 * r0[p] + f1 * r1[p] + f2 * r2[p] + f3 * r3[p]
-            k += BLOCK
-        while k < i:
-            f0, r0 = np.float32(L[i, k]), U[k]
-            for p in range(pixels):
-                row[p] -= f0 * r0[p]
-            k += 1
-        f0 = np.float32(L[i, i])
-        for p in range(pixels):
-            row[p] *= f0
     blocks = (m + BLOCK - 1) // BLOCK
-    for i in range(m, blocks * BLOCK):
-        y[i] = 0.0
-        U[i, :pixels] = 0
-
-    start = z[0]
+    L[m : blocks * BLOCK] = 0
+    y[m : blocks * BLOCK] = 0
+    ref = distances[row_of[0], first : first + pixels + stride]
+    for p in range(pixels):
+        toward = scale * ref[p] + nugget
+        estimate[p] = z[0]
+        variance[p] = toward + toward
     step = scale - nugget  # a * 1^w, less the nugget that two pixels do not share
     for p in range(pixels):
-        estimate[p] = start
+        right[p] = scale * (ref[p] + ref[p + 1]) - step
     for p in range(pixels):
-        variance[p] = np.float32(2.0) * (scale * to_reference[p] + nugget)
-    for p in range(inner):
-        right[p] = scale * (to_reference[p] + to_reference[p + 1]) + np.float32(2.0) * nugget
-        right[p] -= scale + nugget
-    for p in range(inner):
-        below[p] = scale * (to_reference[p] + to_reference[p + stride]) - step
-    for block in range(blocks):
-        k = block * BLOCK
+        below[p] = scale * (ref[p] + ref[p + stride]) - step
+
+    for k in range(0, blocks * BLOCK, BLOCK):
+        block = U[k * _STRIDE : (k + BLOCK) * _STRIDE]
+        # Rows that fill the last block up are the reference's own, and nothing.
+        n0, n1 = row_of[k + 1], row_of[k + 2] if k + 1 < m else row_of[0]
+        n2 = row_of[k + 3] if k + 2 < m else row_of[0]
+        n3 = row_of[k + 4] if k + 3 < m else row_of[0]
+        c0, c1 = (
+            np.float32(a * between[row_of[0], n0] + b),
+            np.float32(a * between[row_of[0], n1] + b),
+        )
+        c2, c3 = (
+            np.float32(a * between[row_of[0], n2] + b),
+            np.float32(a * between[row_of[0], n3] + b),
+        )
+        h0, h1 = distances[n0, first : first + pixels], distances[n1, first : first + pixels]
+        h2, h3 = distances[n2, first : first + pixels], distances[n3, first : first + pixels]
+        for p in range(pixels):
+            block[p] = c0 + scale * (ref[p] - h0[p])
+            block[_STRIDE + p] = c1 + scale * (ref[p] - h1[p])
+            block[2 * _STRIDE + p] = c2 + scale * (ref[p] - h2[p])
+            block[3 * _STRIDE + p] = c3 + scale * (ref[p] - h3[p])
+        for e in range(0, k, BLOCK):
+            earlier = U[e * _STRIDE : (e + BLOCK) * _STRIDE]
+            _subtract_block(block, earlier, L[k : k + BLOCK], e, pixels)
+        _solve_block(block, L[k : k + BLOCK, k : k + BLOCK], pixels)
         f0, f1, f2, f3 = (
             np.float32(y[k]),
             np.float32(y[k + 1]),
             np.float32(y[k + 2]),
             np.float32(y[k + 3]),
         )
-        r0, r1, r2, r3 = U[k], U[k + 1], U[k + 2], U[k + 3]
         for p in range(pixels):
-            estimate[p] += f0 * r0[p] + f1 * r1[p] + f2 * r2[p] + f3 * r3[p]
+            r0, r1 = block[p], block[_STRIDE + p]
+            r2, r3 = block[2 * _STRIDE + p], block[3 * _STRIDE + p]
+            estimate[p] += f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3
+            variance[p] -= r0 * r0 + r1 * r1 + r2 * r2 + r3 * r3
         for p in range(pixels):
-            variance[p] -= r0[p] * r0[p] + r1[p] * r1[p] + r2[p] * r2[p] + r3[p] * r3[p]
-        for p in range(inner):
-            c = r0[p] * r0[p + 1] + r1[p] * r1[p + 1]
-            right[p] -= c + r2[p] * r2[p + 1] + r3[p] * r3[p + 1]
-        for p in range(inner):
-            q = p + stride
-            below[p] -= r0[p] * r0[q] + r1[p] * r1[q] + r2[p] * r2[q] + r3[p] * r3[q]
+            c = block[p] * block[p + 1] + block[_STRIDE + p] * block[_STRIDE + p + 1]
+            c += block[2 * _STRIDE + p] * block[2 * _STRIDE + p + 1]
+            right[p] -= c + block[3 * _STRIDE + p] * block[3 * _STRIDE + p + 1]
+        under = block[stride:]
+        for p in range(pixels):
+            c = block[p] * under[p] + block[_STRIDE + p] * under[_STRIDE + p]
+            c += block[2 * _STRIDE + p] * under[2 * _STRIDE + p]
+            below[p] -= c + block[3 * _STRIDE + p] * under[3 * _STRIDE + p]
 
     _improve(samples, count, u0, v0, width, height, frame_shape, scratch)
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _improve(samples, count, u0, v0, width, height, frame_shape, scratch):  # type: ignore[no-untyped-def]
     """Eq. (23) from estimates, variances and the covariances of neighbours."""
     u, v, z, _ = samples
     estimate, variance, improvement, inverse, right, below = scratch[:6]
     stride = width + 2
-    pixels = stride * (height + 2)
+    pixels = (stride * (height + 2) + VECTOR - 1) // VECTOR * VECTOR
     least = z[0]
     for i in range(1, count):
         least = min(least, z[i])
     floor = np.float32(0.5) * least
+    tiny = np.float32(1e-30)
     for p in range(pixels):
-        estimate[p] = max(estimate[p], floor)
-    for p in range(pixels):
-        inverse[p] = np.float32(1.0) / estimate[p]
+        raised = max(estimate[p], floor)
+        estimate[p] = raised
+        inverse[p] = np.float32(1.0) / raised
+        variance[p] = max(variance[p], tiny)
     frame_height, frame_width = frame_shape
     if u0 < 1 or v0 < 1 or u0 + width >= frame_width or v0 + height >= frame_height:
         for row in range(height + 2):
@@ -218,16 +271,13 @@ def _improve(samples, count, u0, v0, width, height, frame_shape, scratch):  # ty
 
     # Views that start where the loops do, and two loops of few arrays: the compiler has to
     # prove that none overlaps another.
-    size = pixels - 2 * stride
+    size = (stride * height + VECTOR - 1) // VECTOR * VECTOR
     here, kept = inverse[stride:], variance[stride:]
     result = improvement[stride:]
     left_of, right_of = inverse[stride - 1 :], inverse[stride + 1 :]
     to_left, to_right = right[stride - 1 :], right[stride:]
     to_above, to_below = below, below[stride:]
     above, under = inverse, inverse[2 * stride :]
-    tiny = np.float32(1e-30)
-    for p in range(size):
-        kept[p] = max(kept[p], tiny)
     for p in range(size):
         around = to_left[p] * to_left[p] * left_of[p] + to_right[p] * to_right[p] * right_of[p]
         result[p] = kept[p] * here[p] + around / kept[p]

@@ -11,7 +11,7 @@ from numba import njit
 
 from selective_depth.selectors.lattice_tables import CONTRASTS, SEEDS
 
-LANES = 32
+LANES = 64
 """Windows that are kriged side by side."""
 
 # Rows of the first scratch array, LANES wide. Constant places in one array: only so can the
@@ -24,7 +24,8 @@ _CENTRE = _MEAN + LANES
 _A = _CENTRE + LANES
 _B = _A + LANES
 _FLOOR = _B + LANES
-_ROWS_END = _FLOOR + LANES
+_AROUND = _FLOOR + LANES  # what a pixel's neighbours add to its improvement
+_ROWS_END = _AROUND + LANES
 
 
 def lattice_scratch(most_pixels: int):  # type: ignore[no-untyped-def]
@@ -36,7 +37,7 @@ def lattice_scratch(most_pixels: int):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
     padded, i, order, batch, geometry, up, down, left, right, tables, scratch, strip
 ):
@@ -62,7 +63,7 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
         Filled with estimate, variance and improvement.
     """
     (
-        first_pixel, first_pair, _, vectors, is_seed, products, bases, basis, eigenvalues,
+        first_pixel, first_pair, _, _, vectors, is_seed, products, bases, basis, eigenvalues,
         distance_sums, moments,
     ) = tables  # fmt: skip
     s, inverse, covariance = scratch
@@ -127,17 +128,17 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
             for n in range(LANES):
                 to_left, to_right = covariance[beside, n], covariance[beside + 1, n]
                 around = to_left * to_left * inverse[p - 1, n]
-                around += to_right * to_right * inverse[p + 1, n]
-                kept = max(covariance[itself, n], tiny)
-                strip[2, row, column, batch, n] = kept * inverse[p, n] + around / kept
+                s[_AROUND + n] = around + to_right * to_right * inverse[p + 1, n]
             for n in range(LANES):
                 to_above, to_below = covariance[over, n], covariance[over + width, n]
                 around = to_above * to_above * inverse[p - stride, n]
                 around += to_below * to_below * inverse[p + stride, n]
-                strip[2, row, column, batch, n] += around / max(covariance[itself, n], tiny)
+                kept = max(covariance[itself, n], tiny)
+                around += s[_AROUND + n]
+                strip[2, row, column, batch, n] = kept * inverse[p, n] + around / kept
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _fit_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
     padded, i, order, batch, basis, eigenvalues, distance_sums, moments, s
 ):

@@ -29,6 +29,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.selectors.kriging import padded_pixels
+
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
 
@@ -52,6 +54,8 @@ class LatticeTables:
         Where a geometry's pixels and pairs begin.
     distances : float32 array of shape (9, pixels)
         Distance^w from each seed of the window to each pixel.
+    between : float64 array of shape (geometries, 9, 9)
+        Distance^w between the seeds.
     vectors : float32 array of shape (pixels, 8)
         g of each pixel.
     is_seed : bool array of shape (pixels,)
@@ -73,6 +77,7 @@ class LatticeTables:
     first_pixel: IntArray
     first_pair: IntArray
     distances: FloatArray
+    between: npt.NDArray[np.float64]
     vectors: FloatArray
     is_seed: npt.NDArray[np.bool_]
     products: FloatArray
@@ -85,9 +90,9 @@ class LatticeTables:
     def arrays(self) -> tuple[npt.NDArray[np.generic], ...]:
         """Everything, in order, as the kernels take it."""
         return (
-            self.first_pixel, self.first_pair, self.distances, self.vectors, self.is_seed,
-            self.products, self.bases, self.basis, self.eigenvalues, self.distance_sums,
-            self.moments,
+            self.first_pixel, self.first_pair, self.distances, self.between, self.vectors,
+            self.is_seed, self.products, self.bases, self.basis, self.eigenvalues,
+            self.distance_sums, self.moments,
         )  # fmt: skip
 
     @property
@@ -121,6 +126,7 @@ def build_tables(geometries: list[tuple[int, int, int, int]], exponent: float) -
         first_pixel=np.concatenate(([0], np.cumsum(pixels)[:-1])).astype(np.int64),
         first_pair=np.concatenate(([0], np.cumsum(pairs)[:-1])).astype(np.int64),
         distances=joined("distances", axis=1),
+        between=np.stack([part["between"] for part in parts]).astype(np.float64),
         vectors=joined("vectors"),
         is_seed=np.concatenate([part["is_seed"] for part in parts]).astype(np.bool_),
         products=joined("products"),
@@ -151,15 +157,18 @@ def _tabulate(
     g = V.T @ (h - H.mean(axis=1, keepdims=True))
     f = h.mean(axis=0) - H.mean() / 2
 
+    # Loops over pixels run on behind the last.
+    rest = padded_pixels(width - 2, height - 2) - height * width
     number = np.arange(height * width).reshape(height, width)
     itself = number[1:-1, 1:-1].ravel()
     across, down_from = number[1:-1, :-1].ravel(), number[:-1, 1:-1].ravel()
     one = np.concatenate((itself, across, down_from))
     other = np.concatenate((itself, across + 1, down_from + width))
     return {
-        "distances": h,
-        "vectors": g.T,
-        "is_seed": (h == 0).any(axis=0),
+        "distances": np.pad(h, ((0, 0), (0, rest))),
+        "between": H,
+        "vectors": np.pad(g.T, ((0, rest), (0, 0))),
+        "is_seed": np.pad((h == 0).any(axis=0), (0, rest)),
         "products": (g[:, one] * g[:, other]).T,
         # Neighbouring pixels are 1 apart, and 1^w = 1.
         "bases": f[one] + f[other] - (one != other),

@@ -41,7 +41,7 @@ def power_table(exponent: float, reach: int) -> npt.NDArray[np.float64]:
     return squared ** (exponent / 2)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, forceinline=True, nogil=True)
 def fit_moments(
     s0: float, s1: float, s2: float, t0: float, t1: float
 ) -> tuple[float, float]:  # pragma: no cover - compiled
@@ -74,14 +74,24 @@ def fit_moments(
     return a, b
 
 
-@njit(cache=True, nogil=True)
-def fit_samples(u, v, z, count, power):  # type: ignore[no-untyped-def] # pragma: no cover
-    """Fit (a, b) to all pairs of the first `count` samples at columns u, rows v, depths z."""
-    reach = power.shape[0] // 2
+@njit(cache=True, forceinline=True, nogil=True)
+def fit_samples(z, row_of, count, between):  # type: ignore[no-untyped-def] # pragma: no cover
+    """Fit (a, b) to all pairs of the first `count` samples.
+
+    Parameters
+    ----------
+    z : array
+        Depths in mm.
+    row_of : int64 array
+        Row and column of each sample in `between`.
+    between : float64 array of shape (n, n)
+        Distance^w of each pair.
+    """
     s0 = s1 = s2 = t0 = t1 = 0.0
     for i in range(1, count):
+        row = between[row_of[i]]
         for j in range(i):
-            h = power[reach + v[i] - v[j], reach + u[i] - u[j]]
+            h = row[row_of[j]]
             difference = np.float64(z[i]) - np.float64(z[j])
             half_square = 0.5 * difference * difference
             s0 += 1.0

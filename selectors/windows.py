@@ -16,6 +16,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.selectors.kriging import padded_pixels
 from selective_depth.selectors.lattice_kernel import LANES
 from selective_depth.selectors.lattice_tables import LatticeTables, build_tables
 from selective_depth.selectors.seeds import SeedGrid, cell_centres
@@ -160,7 +161,8 @@ class Windows:
             Where each lattice column went: batch * LANES + lane.
         """
         which = self.columns.shapes[1]
-        batches, shape_of = [], []
+        batches: list[IntArray] = []
+        shape_of = []
         place = np.zeros(len(which), np.int64)
         for shape in range(len(self.columns.shapes[0])):
             members = np.flatnonzero(which == shape)
@@ -186,18 +188,17 @@ class Windows:
             rows.blend,
             columns.blend,
             (lanes_columns, shape_of, place),
-            (first, second, *cells),
+            tuple(index.astype(np.uint32) for index in (first, second, *cells)),
             self.tables.arrays(),
-            self.power,
             self.reach_px**2,
         )
 
     @property
     def most_pixels(self) -> int:
-        """Pixels in the largest window, rim included."""
-        heights = self.rows.before + self.rows.after + 1
-        widths = self.columns.before + self.columns.after + 1
-        return int(heights.max() * widths.max())
+        """Room for the pixels of the largest window, `kriging.padded_pixels`."""
+        height = int((self.rows.before + self.rows.after).max()) - 1
+        width = int((self.columns.before + self.columns.after).max()) - 1
+        return padded_pixels(width, height)
 
 
 def _pitch(pixels: int, count: int) -> float:
