@@ -37,6 +37,8 @@ CLOSE_S = 1.0
 """How long a place may take over its last frames, and all of them together:"""
 CLOSE_ALL_S = 2.5
 FILE_QUEUE = 8
+INDEXED_FRAMES = 1000
+"""Up to so many frames a file gets an index; beyond, its memory would be felt."""
 
 
 class Place:
@@ -98,9 +100,12 @@ class FilePlace(Place):
     failure the file is cut back to there.
     """
 
-    def __init__(self, path: Path, options: ViewerOptions, times: StageTimes) -> None:
+    def __init__(
+        self, path: Path, options: ViewerOptions, times: StageTimes, *, index: bool
+    ) -> None:
         super().__init__(f"file '{path}'", options, times)
         self.path = path
+        self._index = index
         self._sure_bytes = 0
         self._checked_s = time.monotonic()
         try:
@@ -132,7 +137,7 @@ class FilePlace(Place):
             self._recording.finish()
 
     def _connect(self) -> Recording:
-        return Recording.to_file(self.path, self.options)
+        return Recording.to_file(self.path, self.options, index=self._index)
 
     def _make_sure(self, patience_s: float) -> None:
         assert self._recording is not None
@@ -262,6 +267,8 @@ class Viewer:
         recording waits for its file always, and for a viewer that is not stalled.
     times : StageTimes
         Where the time that logging takes is added, as stage ``log``.
+    frames : int, optional
+        How many frames will come at most; a file of few gets an index.
 
     Attributes
     ----------
@@ -274,11 +281,19 @@ class Viewer:
         If a place cannot be written, reached or opened.
     """
 
-    def __init__(self, options: ViewerOptions, *, live: bool, times: StageTimes) -> None:
+    def __init__(
+        self,
+        options: ViewerOptions,
+        *,
+        live: bool,
+        times: StageTimes,
+        frames: int | None = None,
+    ) -> None:
+        index = frames is not None and frames <= INDEXED_FRAMES
         self.window = not options.headless and has_display()
         self._places: list[Place] = []
         if options.save is not None:
-            self._places.append(FilePlace(options.save, options, times))
+            self._places.append(FilePlace(options.save, options, times, index=index))
         if options.serve:
             self._places.append(ServedPlace(options, times))
         if options.connect is not None:

@@ -140,7 +140,8 @@ class Session:
             seen = _with_a_place(self.settings.viewer, self._uri)
             self.settings = dataclasses.replace(self.settings, viewer=seen)
             loop = stack.enter_context(Loop(self.settings, every_model=not source.live))
-            viewer = Viewer(seen, live=source.live, times=loop.times)
+            frames = _frames_in_all(self.settings.run.frames, source.frame_count)
+            viewer = Viewer(seen, live=source.live, times=loop.times, frames=frames)
             if seen.serve:
                 say(f"Serving on {seen.serve_address}; join with 'rerun {viewer.served_url}'.")
             try:
@@ -164,8 +165,8 @@ class Session:
         return code
 
     def _turn_all(self, source: DepthSource, loop: Loop, viewer: Viewer) -> None:
-        limit, count = self.settings.run.frames, source.frame_count
-        total = min(limit or count or 0, count or limit or 0) or None
+        limit = self.settings.run.frames
+        total = _frames_in_all(limit, source.frame_count)
         start_s = time.monotonic()
         recent = deque([start_s], maxlen=31)
         with FrameProgress(self._uri, total) as progress:
@@ -265,6 +266,12 @@ def _leave_soon() -> None:
     watchdog = threading.Timer(LEAVE_S, os._exit, (INTERRUPTED,))
     watchdog.daemon = True
     watchdog.start()
+
+
+def _frames_in_all(limit: int | None, count: int | None) -> int | None:
+    """How many frames will come at most; None where nobody knows."""
+    known = [number for number in (limit, count) if number is not None]
+    return min(known, default=None)
 
 
 def _state(source: DepthSource) -> str:

@@ -433,9 +433,13 @@ class Recording:
         self._logger = StepLogger(self._stream, options)
 
     @classmethod
-    def to_file(cls, path: Path, options: ViewerOptions) -> Self:
-        """Write an .rrd."""
-        return cls(rr.FileSink(str(path)), options)
+    def to_file(cls, path: Path, options: ViewerOptions, *, index: bool) -> Self:
+        """Write an .rrd, with an index at its end or without.
+
+        The index makes large files quicker to open, but the SDK gathers it in memory, some
+        20 MB for 1,000 frames.
+        """
+        return cls(rr.FileSink(str(path), write_footer=index), options)
 
     @classmethod
     def to_viewer(cls, url: str, options: ViewerOptions) -> Self:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
@@ -354,3 +355,73 @@ def test_two_places_see_the_same(tmp_path: Path) -> None:
         shown.show(make_step(index))
     assert shown.close() == []
     assert len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)) == 5
+
+
+def test_window_is_opened_and_used(monkeypatch: pytest.MonkeyPatch, listener: Listener) -> None:
+    opened: list[int] = []
+
+    def open_window(port: int, memory: str) -> None:
+        opened.append(port)
+        listener.start()
+
+    listener.kill()
+    monkeypatch.setattr(places, "has_display", lambda: True)
+    monkeypatch.setattr(places, "open_window", open_window)
+    monkeypatch.setattr(places, "VIEWER_PORT", listener.port)
+    for _ in range(2):  # the second run finds the window of the first
+        shown = places.Viewer(ViewerOptions(), live=False, times=StageTimes())
+        assert shown.window
+        shown.wait_ready()
+        for index in range(3):
+            shown.show(make_step(index))
+        assert shown.close() == []
+        assert shown.dropped == {"viewer window": 0}
+    assert opened == [listener.port]
+
+
+@pytest.mark.browser
+def test_web_viewer_shows_the_run(tmp_path: Path) -> None:
+    """Looked at with one's own eyes; here only that it is neither empty nor failing."""
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    executable = viewer.viewer_executable()
+    if chromium is None or executable is None:
+        pytest.skip("no Chromium, or no web viewer in the SDK")
+    recording, picture = tmp_path / "run.rrd", tmp_path / "web.png"
+    save(recording, [make_step(index) for index in range(5)])
+    with (
+        socket.create_server(("127.0.0.1", 0)) as one,
+        socket.create_server(("127.0.0.1", 0)) as other,
+    ):
+        web, grpc = one.getsockname()[1], other.getsockname()[1]
+    serving = [executable, str(recording), "--serve-web", "--bind", "127.0.0.1"]
+    ports = ["--web-viewer-port", str(web), "--port", str(grpc)]
+    server = subprocess.Popen([*serving, *ports], stdout=subprocess.DEVNULL)
+    try:
+        while not places.listens(("127.0.0.1", web)):
+            time.sleep(0.1)
+        stream = f"rerun%2Bhttp://127.0.0.1:{grpc}/proxy"
+        subprocess.run(
+            [
+                chromium,
+                "--headless=new",
+                "--no-sandbox",
+                "--use-gl=angle",
+                "--use-angle=swiftshader",
+                "--enable-unsafe-swiftshader",
+                "--window-size=1600,1000",
+                "--virtual-time-budget=60000",
+                f"--screenshot={picture}",
+                f"http://127.0.0.1:{web}/?url={stream}&renderer=webgl",
+            ],
+            check=True,
+            timeout=180,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+    finally:
+        server.kill()
+        server.wait()
+    image = cv2.imread(str(picture))
+    assert image.shape[:2] == (1000, 1600)
+    colourful = (image.max(axis=2) - image.min(axis=2)) > 60
+    assert colourful.mean() > 0.05, "the web viewer shows no depth, regions or map"
