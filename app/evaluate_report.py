@@ -98,8 +98,8 @@ def print_results(results: Results, frames: int, rounds: int) -> None:
             title=f"+{float(budget):.0%} of the pixels · {frames} frames"
             f" · closed loops of {rounds} rounds",
             title_justify="left",
-            caption="ratio of the RMSE (mm) to uniform's, geometric mean and worst; share of the way"
-            " from uniform to the oracle, mean and least; wrong: off by > 20 mm and > 2 %",
+            caption="ratio of the RMSE (mm) to uniform's, geometric mean and worst; share of the"
+            " way from uniform to the oracle, mean and least; wrong: off by > 20 mm and > 2 %",
             caption_justify="left",
             padding=(0, 0, 0, 1),
             box=SIMPLE_HEAD,
