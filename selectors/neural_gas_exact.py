@@ -157,7 +157,7 @@ def _within(d2, nearest, reach, found, key):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _order_few(key, found, count, order):  # type: ignore[no-untyped-def]
+def _order_few(key, count, order):  # type: ignore[no-untyped-def]
     """Order by counting the smaller keys: quadratic, but free of branches."""
     for i in range(count):
         own = key[i]
@@ -166,7 +166,7 @@ def _order_few(key, found, count, order):  # type: ignore[no-untyped-def]
             rank += int(key[j] <= own)
         for j in range(i + 1, count):
             rank += int(key[j] < own)
-        order[rank] = found[i]
+        order[rank] = i
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz", "contract"})
@@ -188,7 +188,7 @@ def _largest(key, count, lanes):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _order_many(key, found, count, largest, order, packed, spare, starts):  # type: ignore[no-untyped-def]
+def _order_many(key, count, largest, order, spare, starts):  # type: ignore[no-untyped-def]
     """Order by two passes of a radix sort, over distance and place packed into 32 bits."""
     one = np.uint32(1)
     place_bits = one
@@ -200,42 +200,47 @@ def _order_many(key, found, count, largest, order, packed, spare, starts):  # ty
     mask = buckets - one
     to_high = place_bits + bits
     low, high = starts[0], starts[1]
-    low[: buckets + 1] = 0
-    high[: buckets + 1] = 0
+    low[:buckets] = 0
+    high[:buckets] = 0
     scale = (buckets * buckets - 1) * 0.9999 / max(largest, 1e-300)
     for i in range(count):
-        packed[i] = np.uint32(key[i] * scale) << place_bits | np.uint32(i)
+        order[i] = np.uint32(key[i] * scale) << place_bits | np.uint32(i)
     for i in range(count):
-        step = packed[i] >> place_bits
-        low[(step & mask) + one] += one
-        high[(step >> bits) + one] += one
+        step = order[i] >> place_bits
+        low[step & mask] += one
+        high[step >> bits] += one
+    low_end, high_end = np.uint32(0), np.uint32(0)
     for b in range(buckets):
-        low[b + 1] += low[b]
-        high[b + 1] += high[b]
+        low_size, high_size = low[b], high[b]
+        low[b], high[b] = low_end, high_end
+        low_end += low_size
+        high_end += high_size
     for i in range(count):
-        item = packed[i]
+        item = order[i]
         b = item >> place_bits & mask
-        spare[low[b]] = item
-        low[b] += one
+        at = low[b]
+        spare[at] = item
+        low[b] = at + one
     for i in range(count):
         item = spare[i]
         b = item >> to_high
-        packed[high[b]] = item
-        high[b] += one
+        at = high[b]
+        order[at] = item
+        high[b] = at + one
     place = (one << place_bits) - one
+    for i in range(1, count):
+        item = order[i]
+        if order[i - 1] >> place_bits == item >> place_bits:
+            # Distances that share a step are still by place: put these few right.
+            j = i
+            while j > 0 and order[j - 1] >> place_bits == item >> place_bits:
+                if key[order[j - 1] & place] <= key[item & place]:
+                    break
+                order[j] = order[j - 1]
+                j -= 1
+            order[j] = item
     for i in range(count):
-        item = packed[i]
-        order[i] = found[item & place]
-        # Distances that share a step are in the order found: put these few right.
-        j = i
-        while j > 0 and packed[j - 1] >> place_bits == item >> place_bits:
-            if key[packed[j - 1] & place] <= key[item & place]:
-                break
-            packed[j] = packed[j - 1]
-            order[j] = order[j - 1]
-            j -= 1
-        packed[j] = item
-        order[j] = found[item & place]
+        order[i] &= place
 
 
 @njit(cache=True, nogil=True)
@@ -307,12 +312,10 @@ def _anneal(points, nodes, count, draws, lambda_first):  # type: ignore[no-untyp
     flat_d2 = d2.ravel()
     nearest = np.empty(groups)
     key = np.empty(size + 1)
-    everyone = np.arange(size).astype(np.uint32)
     found = np.empty(size + 1, np.uint32)
     order = np.empty(size + 1, np.uint32)
-    packed = np.empty(size + 1, np.uint32)
     spare = np.empty(size + 1, np.uint32)
-    starts = np.empty((2, 1025), np.uint32)
+    starts = np.empty((2, 1024), np.uint32)
     weight = np.empty(size)
     share = np.zeros((_MEMBERS, groups))
     flat_share = share.ravel()
@@ -345,7 +348,7 @@ def _anneal(points, nodes, count, draws, lambda_first):  # type: ignore[no-untyp
         if moving > count // 2:
             # Most nodes move: order them all, without looking for those in reach.
             largest = _largest(flat_d2, count, lanes)
-            _order_many(flat_d2, everyone, count, largest, order, packed, spare, starts)
+            _order_many(flat_d2, count, largest, order, spare, starts)
             for k in range(moving):
                 flat_share[order[k]] = weight[k]
             for k in range(moving, count):
@@ -361,12 +364,12 @@ def _anneal(points, nodes, count, draws, lambda_first):  # type: ignore[no-untyp
             have = _within(d2, nearest, reach, found, key)
         if have > _FEW:
             largest = _largest(key, have, lanes)
-            _order_many(key, found, have, largest, order, packed, spare, starts)
+            _order_many(key, have, largest, order, spare, starts)
         else:
-            _order_few(key, found, have, order)
-        reaches[p] = flat_d2[order[moving - 1]] / moving
+            _order_few(key, have, order)
+        reaches[p] = key[order[moving - 1]] / moving
         for k in range(moving):
-            i = order[k]
+            i = found[order[k]]
             wx[i] += weight[k] * (x - wx[i])
             wy[i] += weight[k] * (y - wy[i])
             wz[i] += weight[k] * (z - wz[i])
