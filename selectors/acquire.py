@@ -83,13 +83,13 @@ class Acquisition:
 def shots_of(budget: float, shape: tuple[int, int]) -> int:
     """Number of measurements in a budget: an int is a number, a float a share of the pixels."""
     pixels = shape[0] * shape[1]
-    shots = budget if isinstance(budget, int) else round(budget * pixels)
-    if not 0 <= shots <= pixels:
+    shots = budget if isinstance(budget, int | np.integer) else budget * pixels
+    if not 0 <= shots <= pixels:  # NaN is not either
         raise ValueError(
-            f"a budget of {budget} is {shots} of {pixels} pixels; give a share from 0.0 to 1.0,"
+            f"a budget of {budget} is {shots:g} of {pixels} pixels; give a share from 0.0 to 1.0,"
             " or a whole number of measurements"
         )
-    return int(shots)
+    return round(float(shots))
 
 
 def acquire(
