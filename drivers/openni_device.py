@@ -277,6 +277,7 @@ class OpenNIDevice(DepthSource):
             unheard = unheard + 1 if message is None else 0
             if message is None:
                 if unheard * _BEAT_S > _HANG_S:
+                    self._worker.close()  # at once: it would not stop the sensor any more
                     return "reconnecting", "OpenNI2 hangs"
             elif message["kind"] == "frame":
                 misfits = 0

@@ -18,11 +18,12 @@ import signal
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 from primesense import _openni2 as c_api
 from primesense import openni2
-from primesense.utils import InitializationError, OpenNIError
+from primesense.utils import OpenNIError
 
 WAIT_S = 0.2  # longest uninterrupted wait for a frame, and the beat of "idle" messages
 SILENT_FILE_S = 5.0  # a file in lock-step delivers within milliseconds; beyond this it is stuck
@@ -146,16 +147,25 @@ class Slots:
 
 
 def initialize(job: dict[str, Any]) -> None:
-    """Load the runtime, once in a process's life."""
-    folder, openni2._dll_name = os.path.split(job["library"])
+    """Load the runtime, once in a process's life.
+
+    As the library's own `initialize` does, but for one file by its full name and with the reason
+    kept: what that raises is a list of tuples in a string.
+    """
+    before = Path.cwd()
     try:
-        openni2.initialize(folder)
-    except (InitializationError, OpenNIError, OSError) as error:
+        os.chdir(Path(job["library"]).parent)  # where it looks for what belongs to it
+        c_api.load_dll(job["library"])
+        c_api.oniInitialize(c_api.ONI_API_VERSION)
+    except (OpenNIError, OSError) as error:
         raise JobError(
             "RuntimeMissingError",
             f"The OpenNI2 runtime {job['library']} cannot be started: {reason(error)}."
             " Install it again, or set OPENNI2_REDIST to another one's folder.",
         ) from error
+    finally:
+        os.chdir(before)
+    openni2._openni2_initialized = True
 
 
 def reason(error: Exception) -> str:
@@ -417,7 +427,7 @@ def native_name(descriptor: int, path: str) -> bytes:
     A byte above 127 in a path crashes the runtime and 1000 bytes abort it. Through its descriptor
     any file opens, and each reader of a recording gets a player of its own.
     """
-    if os.path.isdir("/proc/self/fd"):  # noqa: PTH112 - pathlib would be all it is imported for
+    if Path("/proc/self/fd").is_dir():
         return b"/proc/self/fd/%d" % descriptor
     if not path.isascii() or len(path) > 255:
         raise JobError(

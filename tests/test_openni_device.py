@@ -287,6 +287,18 @@ def test_no_runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         OpenNIDevice()
 
 
+def test_a_broken_runtime(virtual_sensor: VirtualSensor) -> None:
+    for driver in (virtual_sensor.runtime / "OpenNI2" / "Drivers").iterdir():
+        driver.unlink()
+    with pytest.raises(RuntimeMissingError, match=r"cannot be started: Found no files matching"):
+        OpenNIDevice()
+    library = virtual_sensor.runtime / "libOpenNI2.so"
+    library.unlink()
+    library.write_text("no library")
+    with pytest.raises(RuntimeMissingError, match=r"cannot be started: .*too short"):
+        list_devices()
+
+
 def test_the_list_of_sensors(virtual_sensor: VirtualSensor) -> None:
     sensor = DeviceInfo("virtual://0", "selective-depth", "virtual depth sensor", 0, 0)
     assert list_devices() == [sensor]
