@@ -45,10 +45,11 @@ def test_every_frame_once_bit_exact_twenty_times_from_odd_paths(
 ) -> None:
     odd = tmp_path / "mit Leerzeichen" / "Übung ボール.oni"
     long = tmp_path / ("d" * 200) / ("e" * 200) / "long.oni"
-    for path in (odd, long):
-        path.parent.mkdir(parents=True)
+    no_text = tmp_path / os.fsdecode(b"\xff\xfe.oni")
+    for path in (odd, long, no_text):
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.symlink_to(oni_sample.path)
-    for path in [oni_sample.path, odd, long, odd] * 5:
+    for path in [oni_sample.path, odd, long, no_text] * 5:
         check_exact(path, oni_sample)
 
 
