@@ -378,7 +378,7 @@ def draw_epochs(source: str, out: Path, *, save: Path | None, number: int, seed:
     frame = nth_frame(source, number)
     seeds = object_seeds(frame, FIRST_POINTS)
     with waiting(f"training {len(EPOCHS)} times"):
-        trained = list(epoch_selections(seeds, seed=seed))
+        trained = list(epoch_selections(seeds, EPOCHS, FIRST_NODES, seed))
     _save_picture(out, epochs_figure(frame, seeds, trained))
     say(f"wrote {out}")
     if save is not None:
@@ -394,7 +394,7 @@ def draw_densities(source: str, out: Path, *, number: int, epochs: int, seed: in
     _check_picture(out)
     frame = nth_frame(source, number)
     with waiting(f"training {len(DENSITIES)} times"):
-        figure = densities_figure(frame, epochs=epochs, seed=seed)
+        figure = densities_figure(frame, DENSITIES, epochs, seed)
     _save_picture(out, figure)
     say(f"wrote {out}")
     return 0
@@ -419,7 +419,7 @@ def tabulate_nodes(source: str, *, every: int | None, out: Path | None) -> int:
     if not frames:
         raise UsageError(f"'{source}' has no frame to tabulate.")
     rows = []
-    for row in node_table(frames):
+    for row in node_table(frames, TABLE_NODES, TABLE_EPOCHS):
         rows.append(row)
         say(f"{row.nodes:,} nodes, {row.training}: {row.seconds:.3g} s")
     table = table_markdown(rows)
