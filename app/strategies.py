@@ -18,7 +18,7 @@ from selective_depth.selectors.neural_gas import NeuralGasSelector
 from selective_depth.selectors.reconstruct import nearest_sample, reconstruct
 from selective_depth.selectors.regions import RegionSelection
 from selective_depth.selectors.samples import Samples
-from selective_depth.selectors.scores import REACH_PX, Score
+from selective_depth.selectors.scores import Score
 from selective_depth.selectors.seeds import SeedGrid
 
 Pixels = npt.NDArray[np.int32]
@@ -79,7 +79,7 @@ class Case:
     @cached_property
     def open(self) -> npt.NDArray[np.bool_]:
         """Pixels that may be shot in one go: no seed, and not so far from all that it is a hole."""
-        free = self.gap_px <= REACH_PX
+        free = self.gap_px <= Samples.of(self.seeds).reach_px
         free[self.seed_uv[:, 1], self.seed_uv[:, 0]] = False
         return free
 
@@ -126,9 +126,17 @@ def _even_rank(shape: tuple[int, int]) -> npt.NDArray[np.float64]:
     return rank / 4.0**bits
 
 
+@dataclass(frozen=True)
 class ImprovementScore(Score):
-    """The published metric (eq. 23) as the score of a closed loop."""
+    """The published metric (eq. 23) as the score of a closed loop.
 
+    Parameters
+    ----------
+    lattice : tuple of int
+        Rows and columns of the seeds, which set the size of the kriging windows.
+    """
+
+    lattice: tuple[int, int]
     name = "improvement"
 
     def map(self, samples: Samples, threads: int | None = None) -> npt.NDArray[np.float32]:
@@ -136,7 +144,10 @@ class ImprovementScore(Score):
         rows, columns = np.nonzero(samples.image_mm)
         uv = np.stack((columns, rows), axis=-1)
         depth_mm = samples.image_mm[rows, columns]
-        raw = improvement_scattered(uv, depth_mm, samples.shape, threads=threads).raw
+        made = improvement_scattered(
+            uv, depth_mm, samples.shape, lattice=self.lattice, threads=threads
+        )
+        raw = made.raw
         raw[samples.image_mm != 0] = 0
         return np.nan_to_num(raw)
 
@@ -217,7 +228,8 @@ STRATEGIES: dict[str, Strategy] = {
         "published improvement (eq. 23), one shot", lambda c: c.best(c.improvement.raw)
     ),
     "improvement_loop": Strategy(
-        "published improvement, closed loop", lambda c: _loop(c, c.rounds, ImprovementScore())
+        "published improvement, closed loop",
+        lambda c: _loop(c, c.rounds, ImprovementScore(c.seeds_shape)),
     ),
     "gradient": Strategy("gradient of the interpolated depth, one shot", _gradient),
     "step": Strategy("step score, one shot", lambda c: _loop(c, 1)),

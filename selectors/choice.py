@@ -7,7 +7,6 @@ import numpy.typing as npt
 from numba import njit
 
 from selective_depth.selectors.parallel import in_bands
-from selective_depth.selectors.samples import TILE_PX
 
 CROWDED = 0.3
 """Factor on the worth of a pixel beside a better one, whose shot will mostly tell the same.
@@ -15,12 +14,15 @@ CROWDED = 0.3
 With 1 shots clump; with 0 (3x3 maxima first, whatever they are worth) they are wasted on maxima
 of nothing as soon as the good ones are gone. Between .2 and .7 it hardly matters."""
 
+_TILE_PX = 16
+
 
 @njit(cache=True, nogil=True)
 def _gather(
     score: npt.NDArray[np.float32],
     tiles: npt.NDArray[np.int64],
     current: npt.NDArray[np.bool_],
+    tile_px: int,
     least: float,
     crowded: float,
     pixel: npt.NDArray[np.int64],
@@ -31,11 +33,11 @@ def _gather(
     """Pixels of the tiles first..end worth at least `least`, written from first's place on."""
     height, width = score.shape
     tile_columns = current.shape[1]
-    at = first * TILE_PX * TILE_PX
+    at = first * tile_px * tile_px
     for k in range(first, end):
-        top, left = tiles[k] // tile_columns * TILE_PX, tiles[k] % tile_columns * TILE_PX
-        for v in range(top, min(top + TILE_PX, height)):
-            for u in range(left, min(left + TILE_PX, width)):
+        top, left = tiles[k] // tile_columns * tile_px, tiles[k] % tile_columns * tile_px
+        for v in range(top, min(top + tile_px, height)):
+            for u in range(left, min(left + tile_px, width)):
                 s = score[v, u]
                 if s <= 0 or s < least:
                     continue
@@ -43,7 +45,7 @@ def _gather(
                 for y in range(max(v - 1, 0), min(v + 2, height)):
                     for x in range(max(u - 1, 0), min(u + 2, width)):
                         # A tile that is not current holds nothing as good as `least`.
-                        if score[y, x] > s and current[y // TILE_PX, x // TILE_PX]:
+                        if score[y, x] > s and current[y // tile_px, x // tile_px]:
                             better = True
                 if better:
                     s *= np.float32(crowded)
@@ -52,7 +54,7 @@ def _gather(
                 pixel[at] = v * width + u
                 worth[at] = s
                 at += 1
-    return at - first * TILE_PX * TILE_PX
+    return at - first * tile_px * tile_px
 
 
 def best_pixels(
@@ -61,6 +63,7 @@ def best_pixels(
     shots: int,
     least: float,
     current: npt.NDArray[np.bool_],
+    tile_px: int,
     threads: int | None = None,
     crowded: float = CROWDED,
 ) -> tuple[npt.NDArray[np.int32], np.float32]:
@@ -71,13 +74,15 @@ def best_pixels(
     score : float32 array of shape (H, W)
         Worth of a shot at each pixel; those with 0 are never chosen.
     tiles : int array
-        Tiles of `TILE_PX` to choose from, numbered row by row.
+        Tiles to choose from, numbered row by row.
     shots : int
         How many pixels at most.
     least : float
         Pixels worth less are left out.
     current : bool array of shape (rows, columns)
         Tiles whose scores hold; others are taken to be worth less than `least`.
+    tile_px : int
+        Side of the tiles.
     threads : int, optional
         Kernel threads.
     crowded : float, default `CROWDED`
@@ -90,13 +95,13 @@ def best_pixels(
     worst : float32
         Worth of the last one chosen, 0 if there is none.
     """
-    room = len(tiles) * TILE_PX * TILE_PX
+    room = len(tiles) * tile_px * tile_px
     pixel, worth = np.empty(room, np.int64), np.empty(room, np.float32)
     parts: list[tuple[int, int]] = []
 
     def band(first: int, end: int) -> None:
-        count = _gather(score, tiles, current, least, crowded, pixel, worth, first, end)
-        parts.append((first * TILE_PX * TILE_PX, count))
+        count = _gather(score, tiles, current, tile_px, least, crowded, pixel, worth, first, end)
+        parts.append((first * tile_px * tile_px, count))
 
     if shots > 0 and len(tiles):
         in_bands(band, len(tiles), threads)
@@ -126,6 +131,7 @@ def choose(
     threads: int | None = None,
 ) -> npt.NDArray[np.int32]:
     """The pixels of a whole map that are worth most (see `best_pixels`)."""
-    tiles = -(-score.shape[0] // TILE_PX), -(-score.shape[1] // TILE_PX)
+    tiles = -(-score.shape[0] // _TILE_PX), -(-score.shape[1] // _TILE_PX)
     current = np.ones(tiles, np.bool_)
-    return best_pixels(score, np.arange(current.size), shots, 0.0, current, threads, crowded)[0]
+    every = np.arange(current.size)
+    return best_pixels(score, every, shots, 0.0, current, _TILE_PX, threads, crowded)[0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 from numba import njit
@@ -11,8 +13,7 @@ from selective_depth.selectors.seeds import SeedGrid
 MISSED = np.float32(-1)
 """In an image of samples: measured, but nothing returned."""
 
-TILE_PX = 10
-"""Side of the square tiles in which changes and depth ranges are booked, pixels."""
+_WORD = 64
 
 
 @njit(cache=True, nogil=True)
@@ -24,12 +25,13 @@ def _record(
     low_mm: npt.NDArray[np.float32],
     high_mm: npt.NDArray[np.float32],
     stale: npt.NDArray[np.bool_],
+    tile_px: int,
 ) -> None:
     tile_rows, tile_columns = stale.shape
     for i in range(len(uv)):
         u, v, z = uv[i, 0], uv[i, 1], depth_mm[i]
         bits[v, (u >> 6) + 1] |= np.uint64(1) << np.uint64(u & 63)
-        row, column = v // TILE_PX, u // TILE_PX
+        row, column = v // tile_px, u // tile_px
         if z > 0:
             image_mm[v, u] = z
             low_mm[row, column] = min(low_mm[row, column], z)
@@ -41,6 +43,11 @@ def _record(
                 stale[r, c] = True
 
 
+def seed_pitch_px(seeds: SeedGrid) -> float:
+    """Widest step of a seed lattice in pixels."""
+    return max(n / cells for n, cells in zip(seeds.frame_shape, seeds.shape, strict=True))
+
+
 class Samples:
     """The measurements of one frame: an image of them, and an index over it.
 
@@ -48,25 +55,40 @@ class Samples:
     ----------
     shape : tuple of int
         Height and width of the frame in pixels.
+    pitch_px : float, default 5
+        Widest step of the seed lattice, the scale of all distances: 5 for 128x128 seeds on
+        640x480.
 
     Attributes
     ----------
+    reach_px : float
+        1.3 steps: no shot farther than this from a sample that returned depth, for it would
+        mostly hit a hole (6.5 pixels for 128x128 seeds).
+    vote_px : int
+        1.8 steps, at most 31: samples farther than this from a pixel have no say about it.
+    tile_px : int
+        Side of the square tiles in which changes and depth ranges are booked. Greater than
+        `vote_px`, so that a measurement matters to its own and the eight tiles around it only.
     image_mm : float32 array of shape (H, W)
         Depth where a measurement returned, `MISSED` where one did not, 0 where none was made.
     bits : uint64 array of shape (H, words)
         One bit per measured pixel; a word of zeros on either side spares the borders.
     low_mm, high_mm : float32 arrays of shape (rows, columns)
-        Least and greatest depth in each tile of `TILE_PX`; low > high where there is none.
+        Least and greatest depth in each tile; low > high where there is none.
     stale : bool array of shape (rows, columns)
         Tiles measured in, or beside one measured in, since the reader last cleared it.
     """
 
-    def __init__(self, shape: tuple[int, int]) -> None:
+    def __init__(self, shape: tuple[int, int], pitch_px: float = 5.0) -> None:
         height, width = shape
-        tiles = -(-height // TILE_PX), -(-width // TILE_PX)
         self.shape = shape
+        self.pitch_px = pitch_px
+        self.reach_px = 1.3 * pitch_px
+        self.vote_px = min(math.ceil(1.8 * pitch_px), _WORD // 2 - 1)
+        self.tile_px = self.vote_px + 1
+        tiles = -(-height // self.tile_px), -(-width // self.tile_px)
         self.image_mm = np.zeros(shape, np.float32)
-        self.bits = np.zeros((height, (width + 63) // 64 + 2), np.uint64)
+        self.bits = np.zeros((height, (width + _WORD - 1) // _WORD + 2), np.uint64)
         self.low_mm = np.full(tiles, np.inf, np.float32)
         self.high_mm = np.zeros(tiles, np.float32)
         self.stale = np.ones(tiles, np.bool_)
@@ -74,7 +96,7 @@ class Samples:
     @classmethod
     def of(cls, seeds: SeedGrid) -> Samples:
         """The seeds of a frame as its first samples."""
-        samples = cls(seeds.frame_shape)
+        samples = cls(seeds.frame_shape, seed_pitch_px(seeds))
         samples.add(seeds.lattice_uv.reshape(-1, 2), seeds.depth_mm.ravel())
         return samples
 
@@ -88,4 +110,5 @@ class Samples:
             self.low_mm,
             self.high_mm,
             self.stale,
+            self.tile_px,
         )

@@ -20,15 +20,7 @@ from numba import njit
 
 from selective_depth.selectors.choice import best_pixels, choose
 from selective_depth.selectors.parallel import in_bands
-from selective_depth.selectors.samples import TILE_PX, Samples
-
-REACH_PX = 6.5
-"""No shot farther than this from a sample that returned depth: it would mostly hit a hole."""
-
-VOTE_PX = 9
-"""Samples farther than this have no vote; less than `TILE_PX`, so that tiles can be skipped."""
-
-assert VOTE_PX < TILE_PX
+from selective_depth.selectors.samples import Samples
 
 Image = npt.NDArray[np.float32]
 
@@ -82,6 +74,8 @@ def _score_tiles(
     weight_of: Image,
     length_of: Image,
     half_of: npt.NDArray[np.int64],
+    vote_px: int,
+    reach_px: float,
     voters: int,
     gap_px: float,
     noise_mm2: float,
@@ -95,25 +89,26 @@ def _score_tiles(
     greatest whole number whose square is not above it.
     """
     height, width = image_mm.shape
-    tile_columns = (width + TILE_PX - 1) // TILE_PX
+    tile_px = vote_px + 1
+    tile_columns = (width + tile_px - 1) // tile_px
     near_sq = np.empty(voters + 1, np.int64)  # squared distances of the voters, nearest first
     near_mm = np.empty(voters + 1, np.float32)
-    missed_sq = np.empty((2 * VOTE_PX + 1) ** 2, np.int64)
-    reach_sq = int(REACH_PX * REACH_PX)
+    missed_sq = np.empty((2 * vote_px + 1) ** 2, np.int64)
+    reach_sq = reach_px * reach_px
     one = np.uint64(1)
     for k in range(first, end):
-        top = tiles[k] // tile_columns * TILE_PX
-        left = tiles[k] % tile_columns * TILE_PX
-        for v in range(top, min(top + TILE_PX, height)):
-            for u in range(left, min(left + TILE_PX, width)):
+        top = tiles[k] // tile_columns * tile_px
+        left = tiles[k] % tile_columns * tile_px
+        for v in range(top, min(top + tile_px, height)):
+            for u in range(left, min(left + tile_px, width)):
                 score[v, u] = 0
                 if image_mm[v, u] != 0:
                     continue
                 found = 0
                 missed = 0
-                farthest = VOTE_PX * VOTE_PX
+                farthest = vote_px * vote_px
                 # Rows outward: as voters are found, the window closes in on the pixel.
-                for step in range(2 * VOTE_PX + 1):
+                for step in range(2 * vote_px + 1):
                     dv = (step + 1) // 2 if step & 1 else -(step // 2)
                     if dv * dv > farthest:
                         break
@@ -191,9 +186,9 @@ def _tile_bounds(low_mm: Image, high_mm: Image, gap_px: float, noise_mm2: float)
 
 
 @lru_cache(maxsize=8)
-def _tables(falloff: float) -> tuple[Image, Image, npt.NDArray[np.int64]]:
-    """Weight, length and whole root of every squared distance up to `VOTE_PX` squared."""
-    length = np.sqrt(np.arange(VOTE_PX * VOTE_PX + 1))
+def _tables(falloff: float, vote_px: int) -> tuple[Image, Image, npt.NDArray[np.int64]]:
+    """Weight, length and whole root of every squared distance up to `vote_px` squared."""
+    length = np.sqrt(np.arange(vote_px * vote_px + 1))
     weight = 1 / (length**falloff + 1)
     return weight.astype(np.float32), length.astype(np.float32), length.astype(np.int64)
 
@@ -204,7 +199,7 @@ class StepScore(Score):
 
     ``sqrt(P(return)) * (sum_k w_k (z_k - mean)^2 / sum_k w_k + noise^2) * gap`` over the nearest
     samples that returned depth. ``w = 1 / (distance^falloff + 1)``; `mean` is their weighted
-    mean; `gap` is the mean distance of the two nearest, at most `gap_px`; ``P(return)`` is the
+    mean; `gap` is the mean distance of the two nearest, at most so many steps; ``P(return)`` is the
     share of their weight in that of all shots as near, and its root because even a shot that
     misses tells where the hole ends. Chosen on the `livingroom` and `tabletop` frames; figures
     in ``app/docs/evaluation.md``.
@@ -215,8 +210,9 @@ class StepScore(Score):
         How many samples vote. 4 see a step too late, 8 blur it.
     falloff : float, default 3
         How fast a vote fades with distance.
-    gap_px : float, default 4
-        Distance beyond which being farther from the samples counts no more.
+    gap : float, default 0.8
+        Distance, in steps of the seed lattice, beyond which being farther from the samples
+        counts no more (4 pixels for 128x128 seeds on 640x480).
     noise_mm : float, default 1
         Error expected even where all neighbours agree; it spends what is left of a budget on
         the widest gaps.
@@ -224,7 +220,7 @@ class StepScore(Score):
 
     voters: int = 6
     falloff: float = 3.0
-    gap_px: float = 4.0
+    gap: float = 0.8
     noise_mm: float = 1.0
     name = "step score"
 
@@ -245,7 +241,7 @@ class StepScore(Score):
         score: Image,
         threads: int | None,
     ) -> None:
-        weight_of, length_of, half_of = _tables(self.falloff)
+        weight_of, length_of, half_of = _tables(self.falloff, samples.vote_px)
         in_bands(
             lambda first, end: _score_tiles(
                 tiles,
@@ -254,8 +250,10 @@ class StepScore(Score):
                 weight_of,
                 length_of,
                 half_of,
+                samples.vote_px,
+                samples.reach_px,
                 self.voters,
-                self.gap_px,
+                self.gap * samples.pitch_px,
                 self.noise_mm**2,
                 score,
                 first,
@@ -266,7 +264,8 @@ class StepScore(Score):
         )
 
     def _bounds(self, samples: Samples) -> Image:
-        return _tile_bounds(samples.low_mm, samples.high_mm, self.gap_px, self.noise_mm**2)
+        gap_px = self.gap * samples.pitch_px
+        return _tile_bounds(samples.low_mm, samples.high_mm, gap_px, self.noise_mm**2)
 
 
 class _StepPlan(Plan):
@@ -298,7 +297,13 @@ class _StepPlan(Plan):
             self._rule._score(samples, due, self._map, self._threads)
             self._current |= wanted
             chosen, worst = best_pixels(
-                self._map, np.flatnonzero(wanted), shots, float(least), self._current, self._threads
+                self._map,
+                np.flatnonzero(wanted),
+                shots,
+                float(least),
+                self._current,
+                samples.tile_px,
+                self._threads,
             )
             if len(chosen) == shots or least <= 0:
                 self._threshold = worst
@@ -309,5 +314,5 @@ class _StepPlan(Plan):
         """A guess: what the last round ended at, or the tiles that could hold the best."""
         if np.isfinite(self._threshold):
             return np.float32(self._threshold * 0.5)
-        tiles = min(8 * shots // TILE_PX**2 + 1, bound.size)
+        tiles = min(8 * shots // self._samples.tile_px**2 + 1, bound.size)
         return max(np.float32(0), np.partition(bound.ravel(), bound.size - tiles)[-tiles])

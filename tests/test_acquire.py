@@ -15,7 +15,7 @@ from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.choice import CROWDED, choose
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.samples import MISSED, Samples
-from selective_depth.selectors.scores import REACH_PX, VOTE_PX, Plan, Score, StepScore
+from selective_depth.selectors.scores import Plan, Score, StepScore
 from selective_depth.selectors.seeds import SeedGrid
 
 Depth = npt.NDArray[np.uint16]
@@ -107,21 +107,19 @@ def test_a_later_round_may_only_use_what_earlier_rounds_returned() -> None:
     assert not np.array_equal(first.uv, second.uv)
 
 
-def score_reference(
-    samples_mm: npt.NDArray[np.float32], rule: StepScore
-) -> npt.NDArray[np.float64]:
+def score_reference(samples: Samples, rule: StepScore) -> npt.NDArray[np.float64]:
     """The step score by its formula, pixel by pixel."""
+    samples_mm = samples.image_mm
+    vote_sq = samples.vote_px**2
     score = np.zeros(samples_mm.shape)
     rows, columns = np.nonzero(samples_mm)
     depth = samples_mm[rows, columns]
     for v, u in zip(*np.nonzero(samples_mm == 0), strict=True):
         squared = (rows - v) ** 2 + (columns - u) ** 2
-        hits = sorted(
-            (squared[i], i) for i in np.flatnonzero((depth > 0) & (squared <= VOTE_PX**2))
-        )
-        if not hits or hits[0][0] > REACH_PX**2:
+        hits = sorted((squared[i], i) for i in np.flatnonzero((depth > 0) & (squared <= vote_sq)))
+        if not hits or hits[0][0] > samples.reach_px**2:
             continue
-        limit = hits[: rule.voters][-1][0] if len(hits) >= rule.voters else VOTE_PX**2
+        limit = hits[: rule.voters][-1][0] if len(hits) >= rule.voters else vote_sq
         # Of equally near samples any may have the last vote; a tie of depths makes it unique.
         voters = hits[: rule.voters]
         weight = np.array([1 / (d ** (rule.falloff / 2) + 1) for d, _ in voters])
@@ -131,7 +129,11 @@ def score_reference(
         missed = squared[(depth < 0) & (squared <= limit)]
         chance = weight.sum() / (weight.sum() + (1 / (missed ** (rule.falloff / 2) + 1)).sum())
         gaps = np.sqrt([voters[0][0], voters[min(1, len(voters) - 1)][0]])
-        score[v, u] = (spread + rule.noise_mm**2) * chance**0.5 * min(gaps.mean(), rule.gap_px)
+        score[v, u] = (
+            (spread + rule.noise_mm**2)
+            * chance**0.5
+            * min(gaps.mean(), rule.gap * samples.pitch_px)
+        )
     return score
 
 
@@ -142,21 +144,22 @@ def score_reference(
     st.integers(0, 2**32 - 1),
     st.sampled_from([0.002, 0.05, 0.3]),
     st.sampled_from([0, 1, 4000]),
+    st.sampled_from([1.0, 5.0, 10.0, 40.0]),
 )
 def test_the_score_is_its_formula(
-    height: int, width: int, seed: int, density: float, spread_mm: int
+    height: int, width: int, seed: int, density: float, spread_mm: int, pitch_px: float
 ) -> None:
     rng = np.random.default_rng(seed)
     shot = rng.random((height, width)) < density
     depth = np.where(rng.random((height, width)) < 0.2, 0, 1000 + rng.integers(0, spread_mm + 1))
-    samples = Samples((height, width))
+    samples = Samples((height, width), pitch_px)
     v, u = np.nonzero(shot)
     samples.add(np.stack((u, v), axis=-1).astype(np.int32), depth[shot])
     rule = StepScore()
     score = rule.map(samples)
     assert np.isfinite(score).all() and (score >= 0).all()
     assert (score[shot] == 0).all()
-    expected = score_reference(samples.image_mm, rule)
+    expected = score_reference(samples, rule)
     if spread_mm == 0:
         np.testing.assert_allclose(score, expected, rtol=1e-5)
         return
@@ -172,7 +175,7 @@ def test_the_score_is_its_formula_where_no_two_samples_are_equally_near() -> Non
     samples = Samples((20, 20))
     uv = np.array([(10, 10), (13, 10), (9, 5), (3, 11), (16, 17), (12, 2)], np.int32)
     samples.add(uv, np.array([1000, 2000, 0, 1100, 0, 1050]))
-    expected = score_reference(samples.image_mm, rule)
+    expected = score_reference(samples, rule)
     np.testing.assert_allclose(rule.map(samples), expected, rtol=2e-5, atol=1e-3)
 
 
