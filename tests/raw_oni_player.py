@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 HANG_S = 10.0
-SETTLE_S = 0.05
+SETTLE_S = 0.1
 MOST_FRAMES = 200
 
 
@@ -50,10 +50,14 @@ class Outcome:
         return self.ended in ("frames", "error")
 
 
-def play_all(paths: Iterable[Path], library: Path) -> Iterator[Outcome]:
-    """Play files one after the other; an outcome each."""
+def play_all(paths: Iterable[Path], library: Path, patience_s: float = 0.4) -> Iterator[Outcome]:
+    """Play files one after the other; an outcome each.
+
+    `patience_s` is how long a frame is waited for; on a busy machine the short default may be too
+    short.
+    """
     with subprocess.Popen(
-        [sys.executable, __file__, str(library)],
+        [sys.executable, __file__, str(library), str(patience_s)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -76,7 +80,7 @@ def digest_of(frames: Iterable[tuple[int, int, int, bytes]]) -> tuple[int, str]:
     return count, digest.hexdigest()
 
 
-def _play(path: str, library: str) -> dict[str, object]:
+def _play(path: str, library: str, patience_s: float) -> dict[str, object]:
     from primesense import openni2
     from primesense.utils import OpenNIError
 
@@ -95,7 +99,7 @@ def _play(path: str, library: str) -> dict[str, object]:
     def frames() -> Iterator[tuple[int, int, int, bytes]]:
         last = 0
         wanted = announced if 0 < announced <= MOST_FRAMES else MOST_FRAMES
-        while last < wanted and openni2.wait_for_any_stream([stream], 0.4) is not None:
+        while last < wanted and openni2.wait_for_any_stream([stream], patience_s) is not None:
             frame = stream.read_frame()
             number = frame.frameIndex
             if number <= last:  # it plays round and round
@@ -114,12 +118,12 @@ def _play(path: str, library: str) -> dict[str, object]:
     return {"ended": "frames", "frames": count, "digest": digest}
 
 
-def _play_in_child(path: str, library: str) -> dict[str, object]:
+def _play_in_child(path: str, library: str, patience_s: float) -> dict[str, object]:
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
         os.close(reading)
-        os.write(writing, json.dumps(_play(path, library)).encode())
+        os.write(writing, json.dumps(_play(path, library, patience_s)).encode())
         os._exit(0)
     os.close(writing)
     end = time.monotonic() + HANG_S
@@ -143,12 +147,12 @@ def _play_in_child(path: str, library: str) -> dict[str, object]:
     return answered
 
 
-def _serve(library: str) -> None:
+def _serve(library: str, patience_s: float) -> None:
     from primesense import openni2  # noqa: F401 - imported once, for all children
 
     for line in sys.stdin:
-        print(json.dumps(_play_in_child(line.rstrip("\n"), library)), flush=True)
+        print(json.dumps(_play_in_child(line.rstrip("\n"), library, patience_s)), flush=True)
 
 
 if __name__ == "__main__":
-    _serve(sys.argv[1])
+    _serve(sys.argv[1], float(sys.argv[2]))

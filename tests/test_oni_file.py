@@ -132,7 +132,7 @@ def test_the_real_player_delivers_what_is_written_and_what_is_repaired(
     wide = tmp_path / "wide.oni"
     write_oni(wide, _frames(2, Camera.kinect(1280, 1024)))
     paths = [recording, repaired, killed, wide]
-    outcomes = list(play_all(paths, find_runtime().library))
+    outcomes = list(play_all(paths, find_runtime().library, patience_s=3.0))
     for path, outcome, count in zip(paths, outcomes, (COUNT, COUNT - 1, COUNT - 1, 2), strict=True):
         expected = digest_of(
             (frame.index + 1, *frame.shape, frame.depth_mm.tobytes()) for frame in _read(path)
@@ -152,7 +152,7 @@ def test_what_openni2s_recorder_swaps_is_read_rightly_and_can_be_mended_in_place
     path, out = tmp_path / "swapped.oni", tmp_path / "repaired.oni"
     record_oni(depth, path)
     library = find_runtime().library
-    wrong = next(play_all([path], library))
+    wrong = next(play_all([path], library, patience_s=3.0))
     report = inspect_oni(path, decode=True)
     assert report.complete and report.swapped_frames == 2
     np.testing.assert_array_equal([frame.depth_mm for frame in _read(path)], depth)
@@ -162,7 +162,7 @@ def test_what_openni2s_recorder_swaps_is_read_rightly_and_can_be_mended_in_place
     assert repair_oni(path, out).swapped_frames == 0
     assert mend_oni(path) == 2
     assert mend_oni(path) == 0
-    for outcome in play_all([path, out], library):
+    for outcome in play_all([path, out], library, patience_s=3.0):
         assert (outcome.frames, outcome.digest) == right
 
 

