@@ -266,7 +266,10 @@ def _on_canvas(uv: npt.NDArray[np.float32]) -> npt.NDArray[np.int32]:
 
 @dataclass(frozen=True)
 class TableRow:
-    """One training of the table; shares are of the frame's pixels and squared error, 0..1."""
+    """One training of the table; shares are of the frame's pixels and squared error, 0..1.
+
+    Time is that of the processor, all threads together: it does not depend on what else runs.
+    """
 
     nodes: int
     training: str
@@ -312,9 +315,9 @@ def node_table(
             selector = NeuralGasSelector(count, length or 1, "exact" if length else "fast", seed)
             rows = []
             for grid, (square, known) in zip(grids, squares, strict=True):
-                start = time.perf_counter()
+                start = time.process_time()
                 chosen = selector.select(grid)
-                seconds = time.perf_counter() - start
+                seconds = time.process_time() - start
                 shares = [
                     share
                     for region in (chosen.mask, chosen.complement)
@@ -340,7 +343,7 @@ def _squared_error(
 def table_markdown(rows: Sequence[TableRow]) -> str:
     """The table as Markdown."""
     lines = [
-        "| nodes | training | time, s | quantisation error, mm | mask: pixels | mask: error |"
+        "| nodes | training | CPU time, s | quantisation error, mm | mask: pixels | mask: error |"
         " complement: pixels | complement: error |",
         "|" + "---:|" * 8,
     ]

@@ -12,6 +12,7 @@ that share one vertex at infinity, `GHOST`, so that a point outside is inserted 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ from numba import njit
 GHOST = -1
 """The vertex at infinity."""
 
-_BIN_PX = 8  # side of the square bins that remember a triangle to start a search from
+_BIN_PX = 8  # least side of the square bins that remember a triangle to start a search from
 _NEXT = np.array([1, 2, 0, 1], np.int64)
 
 Int32Array = npt.NDArray[np.int32]
@@ -178,6 +179,7 @@ def _insert_all(
     adj: Int32Array,
     count: int,
     bins: Int32Array,
+    bin_px: int,
     changed: npt.NDArray[np.bool_],
 ) -> int:
     """Insert the points first..end but `skip`; returns the new number of triangles."""
@@ -185,7 +187,7 @@ def _insert_all(
     for p in range(first, end):
         if p == skip:
             continue
-        row, column = uv[p, 1] // _BIN_PX, uv[p, 0] // _BIN_PX
+        row, column = uv[p, 1] // bin_px, uv[p, 0] // bin_px
         t = _locate(uv, tri, adj, p, bins[row, column])
         if len(stack) < count:  # one insertion flips at most every triangle
             stack = np.empty(2 * count, np.int32)
@@ -233,6 +235,7 @@ class Mesh:
     tri: Int32Array
     adj: Int32Array
     bins: Int32Array
+    bin_px: int
     changed: npt.NDArray[np.bool_]
     points: int
     triangles: int
@@ -256,7 +259,10 @@ class Mesh:
         points[:n] = uv
         size = 2 * capacity
         tri, adj = np.empty((size, 3), np.int32), np.empty((size, 3), np.int32)
-        side_u, side_v = (int(points[:n, i].max()) // _BIN_PX + 1 for i in (0, 1))
+        extent_u, extent_v = (int(points[:n, i].max()) + 1 for i in (0, 1))
+        # One point a bin, on average: sparse points leave bins of 8 pixels empty.
+        bin_px = max(_BIN_PX, math.isqrt(extent_u * extent_v // n))
+        side_u, side_v = (extent_u - 1) // bin_px + 1, (extent_v - 1) // bin_px + 1
         bins = np.zeros((side_v, side_u), np.int32)
         keys = np.empty(n, np.int64)
         _brio_keys(points[:n], keys)
@@ -266,11 +272,11 @@ class Mesh:
         if third < 0:
             return None
         changed = np.ones(size, np.bool_)
-        count = _insert_all(ordered, 2, n, third, tri, adj, 4, bins, changed)
+        count = _insert_all(ordered, 2, n, third, tri, adj, 4, bins, bin_px, changed)
         # Back to the caller's numbering of the points.
         names = np.append(order, GHOST).astype(np.int32)
         tri[:count] = names[tri[:count]]
-        return cls(points, tri, adj, bins, changed, n, count)
+        return cls(points, tri, adj, bins, bin_px, changed, n, count)
 
     def copy(self, capacity: int = 0) -> Mesh:
         """An independent copy with room for `capacity` points."""
@@ -280,6 +286,7 @@ class Mesh:
             np.empty((2 * capacity, 3), np.int32),
             np.empty((2 * capacity, 3), np.int32),
             self.bins.copy(),
+            self.bin_px,
             np.ones(2 * capacity, np.bool_),
             self.points,
             self.triangles,
@@ -308,6 +315,7 @@ class Mesh:
             self.adj,
             self.triangles,
             self.bins,
+            self.bin_px,
             self.changed,
         )
         self.points = end
