@@ -165,6 +165,20 @@ def test_without_a_sensor_no_file_is_left(
     assert not list(tmp_path.glob("out*"))
 
 
+def test_an_older_recording_is_replaced_only_once_the_sensor_streams(
+    virtual_sensor: VirtualSensor, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.oni"
+    out.write_text("precious")
+    virtual_sensor.set(refuse_start=1)
+    with pytest.raises(DeviceRefusedError):
+        record(out, frames=3, overwrite=True)
+    assert out.read_text() == "precious"
+    virtual_sensor.set(refuse_start=0)
+    assert record(out, frames=3, overwrite=True).problem == ""
+    assert len(images(out)) >= 3
+
+
 def test_without_the_runtime_no_file_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
