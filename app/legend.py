@@ -49,7 +49,7 @@ FIGURES = {
     "dropped_viewer": ("dropped by viewer", 0xCC79A7FF),
     "samples": ("samples", 0x56B4E9FF),
     "quantisation_error_mm": ("quantisation error", 0x26A69AFF),
-    "rmse_mm": ("model RMSE", 0xF0E442FF),
+    "rmse_mm": ("model RMSE", 0xE69F00FF),
 }
 """Running figures of a step: how a plot calls and colours them."""
 
@@ -59,11 +59,12 @@ STAGE_COLOURS = (
     0x26A69AFF,
     0xE69F00FF,
     0xCC79A7FF,
-    0xF0E442FF,
+    0xB8A100FF,
     0xD55E00FF,
-    0xFFFFFFFF,
+    0x8C6BD6FF,
 )
-"""Colours of `timing.STAGES`, after Okabe and Ito: safe for colour-blind eyes."""
+"""Colours of `timing.STAGES`, after Okabe and Ito: safe for colour-blind eyes,
+and to be seen on the viewer's dark background and on its light one."""
 
 
 def depth_limits_mm(depth_mm: npt.NDArray[np.uint16]) -> tuple[int, int]:

@@ -290,6 +290,7 @@ def blueprint(
             origin="/camera",
             contents=contents + ["/camera/depth", "/camera/holes"] * backdrop,
             overrides={"/camera/depth": grey} if backdrop else None,
+            background=legend.BACKGROUND,
             name=name,
         )
 
@@ -319,7 +320,15 @@ def blueprint(
         look_target=(0, 0, look_at_m),
         eye_up=(0, -1, 0),
     )
-    columns.append(rrb.Spatial3DView(origin="/", contents=space, name="In space", eye_controls=eye))
+    columns.append(
+        rrb.Spatial3DView(
+            origin="/",
+            contents=space,
+            name="In space",
+            eye_controls=eye,
+            background=legend.BACKGROUND,
+        )
+    )
 
     def plot(name: str, *figures: str) -> rrb.TimeSeriesView:
         contents = [f"/figures/{figure}" for figure in figures]

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import http.server
+import os
 import shutil
 import signal
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +20,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from selective_depth.app import legend, places, viewer
+from selective_depth.app import cli, legend, places, viewer
 from selective_depth.app.errors import ViewerError
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.step import Model, StateNote, Step
@@ -79,7 +82,7 @@ def make_step(index: int, *, acquiring: bool = True) -> Step:
 
 def save(path: Path, steps: list[Step], **options: Any) -> None:
     chosen = dataclasses.replace(HEADLESS, save=path, **options)
-    shown = places.Viewer(chosen, live=False, times=StageTimes())
+    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=100)
     for step in steps:
         shown.show(step)
     assert shown.close() == []
@@ -156,7 +159,7 @@ def test_every_view_shows_something_that_was_logged(
 
 def test_sensor_state_is_logged_when_it_changes(tmp_path: Path) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
-    shown = places.Viewer(chosen, live=False, times=StageTimes())
+    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=100)
     shown.show(StateNote("lost"))  # before the first frame there is no time to log it at
     shown.show(make_step(0))
     for state in ("stalled", "stalled", "lost", "reconnecting"):
@@ -191,7 +194,7 @@ def test_unwritable_file_is_refused_at_once(tmp_path: Path, place: str) -> None:
 
 def test_full_disk_ends_the_file_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
-    shown = places.Viewer(chosen, live=False, times=StageTimes())
+    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=100)
     usage = shutil.disk_usage(tmp_path)
     room = iter([1 << 30] * 3)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=next(room, 1 << 20)))
@@ -295,7 +298,7 @@ def test_stalled_viewer_holds_up_nobody_and_spares_the_file(
     listener: Listener, tmp_path: Path
 ) -> None:
     options = dataclasses.replace(listener.options, save=tmp_path / "out.rrd")
-    shown = places.Viewer(options, live=True, times=StageTimes())
+    shown = places.Viewer(options, live=True, times=StageTimes(), frames=100)
     step = make_step(0)
     show_for(shown, 1.0, step)
     before = shown.dropped
@@ -350,7 +353,7 @@ def test_two_places_see_the_same(tmp_path: Path) -> None:
     options = dataclasses.replace(
         HEADLESS, save=tmp_path / "out.rrd", serve=True, serve_address=address
     )
-    shown = places.Viewer(options, live=False, times=StageTimes())
+    shown = places.Viewer(options, live=False, times=StageTimes(), frames=100)
     for index in range(5):
         shown.show(make_step(index))
     assert shown.close() == []
@@ -379,49 +382,73 @@ def test_window_is_opened_and_used(monkeypatch: pytest.MonkeyPatch, listener: Li
     assert opened == [listener.port]
 
 
+class SlowPage(http.server.BaseHTTPRequestHandler):
+    """A page with the web viewer in it that takes its time to load.
+
+    Chromium takes its picture when a page has loaded; the viewer is done long after that, so
+    the page waits for an image that comes late.
+    """
+
+    viewer_url = ""
+
+    def do_GET(self) -> None:
+        if self.path != "/":
+            time.sleep(40)
+        self.send_response(200 if self.path == "/" else 404)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+        if self.path == "/":
+            style = "position:fixed;inset:0;width:100%;height:100%;border:0"
+            page = f'<iframe src="{self.viewer_url}" style="{style}"></iframe><img src="/late.png">'
+            self.wfile.write(page.encode())
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        pass
+
+
 @pytest.mark.browser
 def test_web_viewer_shows_the_run(tmp_path: Path) -> None:
-    """Looked at with one's own eyes; here only that it is neither empty nor failing."""
+    """To be looked at with one's own eyes; here only that it is neither empty nor failing."""
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     executable = viewer.viewer_executable()
     if chromium is None or executable is None:
         pytest.skip("no Chromium, or no web viewer in the SDK")
-    recording, picture = tmp_path / "run.rrd", tmp_path / "web.png"
-    save(recording, [make_step(index) for index in range(5)])
-    with (
-        socket.create_server(("127.0.0.1", 0)) as one,
-        socket.create_server(("127.0.0.1", 0)) as other,
-    ):
-        web, grpc = one.getsockname()[1], other.getsockname()[1]
+    recording = tmp_path / "run.rrd"
+    picture = Path(os.environ.get("WEB_PICTURE", tmp_path / "web.png")).resolve()
+    source = os.environ.get("WEB_SOURCE", "virtual:workstation?frames=5")
+    budget = ["--budget", "0.05", "--rounds", "4"]
+    assert cli.run(["replay", source, "--headless", "--save", str(recording), *budget]) == 0
+    ports = []
+    for _ in range(2):
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            ports.append(free.getsockname()[1])
+    web, grpc = map(str, ports)
     serving = [executable, str(recording), "--serve-web", "--bind", "127.0.0.1"]
-    ports = ["--web-viewer-port", str(web), "--port", str(grpc)]
-    server = subprocess.Popen([*serving, *ports], stdout=subprocess.DEVNULL)
+    server = subprocess.Popen(
+        [*serving, "--web-viewer-port", web, "--port", grpc],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    stream = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{grpc}%2Fproxy"
+    SlowPage.viewer_url = f"http://127.0.0.1:{web}/?url={stream}&renderer=webgl"
+    pages = http.server.ThreadingHTTPServer(("127.0.0.1", 0), SlowPage)
+    threading.Thread(target=pages.serve_forever, daemon=True).start()
     try:
-        while not places.listens(("127.0.0.1", web)):
-            time.sleep(0.1)
-        stream = f"rerun%2Bhttp://127.0.0.1:{grpc}/proxy"
+        options = ["--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
+        options += ["--enable-unsafe-swiftshader", "--window-size=1920,1200", "--timeout=90000"]
+        address = f"http://127.0.0.1:{pages.server_port}/"
         subprocess.run(
-            [
-                chromium,
-                "--headless=new",
-                "--no-sandbox",
-                "--use-gl=angle",
-                "--use-angle=swiftshader",
-                "--enable-unsafe-swiftshader",
-                "--window-size=1600,1000",
-                "--virtual-time-budget=60000",
-                f"--screenshot={picture}",
-                f"http://127.0.0.1:{web}/?url={stream}&renderer=webgl",
-            ],
+            [chromium, *options, f"--user-data-dir={tmp_path}", f"--screenshot={picture}", address],
             check=True,
-            timeout=180,
+            timeout=240,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
     finally:
+        pages.shutdown()
         server.kill()
         server.wait()
     image = cv2.imread(str(picture))
-    assert image.shape[:2] == (1000, 1600)
+    assert image.shape[1] == 1920
     colourful = (image.max(axis=2) - image.min(axis=2)) > 60
     assert colourful.mean() > 0.05, "the web viewer shows no depth, regions or map"
