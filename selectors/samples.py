@@ -65,7 +65,8 @@ class Samples:
         1.3 steps: no shot farther than this from a sample that returned depth, for it would
         mostly hit a hole (6.5 pixels for 128x128 seeds).
     vote_px : int
-        1.8 steps, at most 31: samples farther than this from a pixel have no say about it.
+        1.8 steps, at most 21: samples farther than this from a pixel have no say about it. (So
+        much, on both sides of a tile, fits in one word of `bits`.)
     tile_px : int
         Side of the square tiles in which changes and depth ranges are booked. Greater than
         `vote_px`, so that a measurement matters to its own and the eight tiles around it only.
@@ -83,8 +84,8 @@ class Samples:
         height, width = shape
         self.shape = shape
         self.pitch_px = pitch_px
-        self.reach_px = 1.3 * pitch_px
-        self.vote_px = min(math.ceil(1.8 * pitch_px), _WORD // 2 - 1)
+        self.vote_px = min(math.ceil(1.8 * pitch_px), (_WORD - 1) // 3)
+        self.reach_px = min(1.3 * pitch_px, self.vote_px)
         self.tile_px = self.vote_px + 1
         tiles = -(-height // self.tile_px), -(-width // self.tile_px)
         self.image_mm = np.zeros(shape, np.float32)

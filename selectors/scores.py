@@ -95,32 +95,50 @@ def _score_tiles(
     near_mm = np.empty(voters + 1, np.float32)
     missed_sq = np.empty((2 * vote_px + 1) ** 2, np.int64)
     reach_sq = reach_px * reach_px
+    vote_radius = np.float32(vote_px)
     one = np.uint64(1)
+    # Of the rows in reach of a tile, and of a row of it: the shots from `left - vote_px` on.
+    tile_word = np.empty(3 * vote_px + 1, np.uint64)
+    row_word = np.empty(2 * vote_px + 1, np.uint64)
+    row_dv = np.empty(2 * vote_px + 1, np.int64)
     for k in range(first, end):
         top = tiles[k] // tile_columns * tile_px
         left = tiles[k] % tile_columns * tile_px
+        start = left - vote_px + 64  # the padding's width in bits
+        word, shift = start >> 6, np.uint64(start & 63)
+        for i in range(3 * vote_px + 1):
+            y = top - vote_px + i
+            tile_word[i] = 0
+            if 0 <= y < height:
+                tile_word[i] = bits[y, word] >> shift
+                if shift > 0:
+                    tile_word[i] |= bits[y, word + 1] << (np.uint64(64) - shift)
+        # From one pixel to the next, the distance to its last voter grows by one at most.
+        row_radius = vote_radius
         for v in range(top, min(top + tile_px, height)):
+            radius = row_radius = min(row_radius + 1, vote_radius)
+            rows = 0  # those with shots, the nearest first
+            for step in range(2 * vote_px + 1):
+                dv = (step + 1) // 2 if step & 1 else -(step // 2)
+                found_word = tile_word[v + dv - top + vote_px]
+                if found_word:
+                    row_word[rows], row_dv[rows] = found_word, dv
+                    rows += 1
             for u in range(left, min(left + tile_px, width)):
+                radius = min(radius + 1, vote_radius)
                 score[v, u] = 0
                 if image_mm[v, u] != 0:
                     continue
                 found = 0
                 missed = 0
-                farthest = vote_px * vote_px
-                # Rows outward: as voters are found, the window closes in on the pixel.
-                for step in range(2 * vote_px + 1):
-                    dv = (step + 1) // 2 if step & 1 else -(step // 2)
+                farthest = int(radius * radius)
+                # As voters are found, the window closes in on the pixel.
+                for row in range(rows):
+                    dv = row_dv[row]
                     if dv * dv > farthest:
                         break
-                    y = v + dv
-                    if y < 0 or y >= height:
-                        continue
                     half = half_of[farthest - dv * dv]
-                    start = u - half + 64  # in the padded bits
-                    word, shift = start >> 6, np.uint64(start & 63)
-                    window = bits[y, word] >> shift
-                    if shift > 0:
-                        window |= bits[y, word + 1] << (np.uint64(64) - shift)
+                    window = row_word[row] >> np.uint64(u - left + vote_px - half)
                     window &= (one << np.uint64(2 * half + 1)) - one
                     while window:
                         lowest = window & (~window + one)
@@ -129,7 +147,7 @@ def _score_tiles(
                         d = du * du + dv * dv
                         if d > farthest:
                             continue
-                        z = image_mm[y, u + du]
+                        z = image_mm[v + dv, u + du]
                         if z < 0:
                             missed_sq[missed] = d
                             missed += 1
@@ -144,6 +162,10 @@ def _score_tiles(
                             found = min(found + 1, voters)
                             if found == voters:
                                 farthest = near_sq[voters - 1]
+                if found == voters:
+                    radius = length_of[farthest]
+                    if u == left:
+                        row_radius = radius
                 if found == 0 or near_sq[0] > reach_sq:
                     continue
                 returned = np.float32(0)
