@@ -19,8 +19,8 @@ Algorithm = Literal["exact", "fast"]
 class NeuralGasSelector:
     """Select regions by neural gas.
 
-    `select` trains from nothing; `update` goes on from the last frame's nodes, as a live loop
-    wants it (scikit-learn's `fit` and `partial_fit`).
+    `select` trains from nothing; `update` goes on from the last frame's nodes, whichever of the
+    two has made them, as a live loop wants it (scikit-learn's `fit` and `partial_fit`).
 
     Parameters
     ----------
@@ -98,22 +98,14 @@ class NeuralGasSelector:
         if len(points) == 0:
             return self._nothing(seeds)
         if self.algorithm == "fast":
-            return self._regions(
-                seeds, BatchNeuralGas(self.nodes, self.seed, self.threads).train(points, seeds.uv)
-            )
-        nodes_mm = train_exact(points, self.nodes, self.epochs, self.seed)
-        distance, _ = cKDTree(nodes_mm).query(points)
-        return delaunay_regions(
-            nodes_mm,
-            node_pixels(nodes_mm, seeds),
-            seeds.frame_shape,
-            edge_metric=self.edge_metric,
-            factor=self.factor,
-            quantisation_error_mm=float(distance.mean()),
-        )
+            self._live.train(points, seeds.uv)
+        else:
+            nodes_mm = train_exact(points, self.nodes, self.epochs, self.seed)
+            self._live.adopt(nodes_mm, node_pixels(nodes_mm, seeds), points)
+        return self._regions(seeds)
 
     def update(self, seeds: SeedGrid) -> RegionSelection:
-        """Go on from the nodes of the last frame given to `update`; the first trains cold.
+        """Go on from the nodes of the last frame, by batch passes; without one, train cold by them.
 
         Raises
         ------
@@ -123,11 +115,12 @@ class NeuralGasSelector:
         points = _finite_points(seeds)
         if len(points) == 0:
             return self._nothing(seeds)
-        return self._regions(seeds, self._live.update(points, seeds.uv))
+        self._live.update(points, seeds.uv)
+        return self._regions(seeds)
 
-    def _regions(self, seeds: SeedGrid, gas: BatchNeuralGas) -> RegionSelection:
-        # A node that won no seed (fewer seeds than nodes) may lie where there is no surface.
-        camera, nodes_mm = seeds.camera, gas.nodes_mm_[gas.won_]
+    def _regions(self, seeds: SeedGrid) -> RegionSelection:
+        gas, camera = self._live, seeds.camera
+        nodes_mm = gas.nodes_mm_[gas.won_]
         return delaunay_regions(
             nodes_mm,
             gas.nodes_uv_[gas.won_] if camera is None else camera.project_uv(nodes_mm),

@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from scipy.spatial import cKDTree
 
 from selective_depth.selectors.neural_gas_exact import draw_nodes
 from selective_depth.selectors.parallel import in_bands
@@ -58,7 +59,7 @@ class BatchNeuralGas:
     nodes_uv_ : float32 array of shape (N, 2)
         Mean pixel (column, row) of the seeds each node won.
     won_ : bool array of shape (N,)
-        Nodes that won a seed of the last frame; the others mean nothing for it.
+        Nodes that mean something for the last frame: those that won a seed, or were adopted.
     quantisation_error_mm_ : float
         Mean distance of the seeds of the last frame to their winners.
     reheated_ : bool
@@ -101,6 +102,30 @@ class BatchNeuralGas:
         if not hasattr(self, "nodes_mm_"):
             return self.train(points_mm, uv)
         self._pass(points_mm, uv, LIVE_PASSES, REHEAT_AT * self.quantisation_error_mm_)
+        return self
+
+    def adopt(
+        self,
+        nodes_mm: npt.NDArray[np.float32],
+        nodes_uv: npt.NDArray[np.float32],
+        points_mm: npt.NDArray[np.float32],
+    ) -> Self:
+        """Take over nodes trained otherwise, to go on from them.
+
+        Parameters
+        ----------
+        nodes_mm : float32 array of shape (N, 3)
+            Nodes in space.
+        nodes_uv : float32 array of shape (N, 2)
+            Nodes in the image.
+        points_mm : float32 array of shape (M, 3)
+            The points they were trained on, for the quantisation error.
+        """
+        self.nodes_mm_, self.nodes_uv_ = nodes_mm, nodes_uv.copy()
+        self.won_ = np.ones(len(nodes_mm), dtype=np.bool_)
+        distance, _ = cKDTree(nodes_mm).query(points_mm)
+        self.quantisation_error_mm_ = float(distance.mean())
+        self.reheated_ = False
         return self
 
     def _pass(

@@ -346,6 +346,19 @@ def test_equal_seeds_give_equal_selections(algorithm):
     assert not np.array_equal(one.nodes_mm, other.nodes_mm)
 
 
+@pytest.mark.parametrize("algorithm", ["exact", "fast"])
+def test_update_goes_on_from_what_select_has_trained(algorithm):
+    camera = Camera.kinect(160, 120)
+    depth = (1000 + np.add.outer(np.arange(120), 3 * np.arange(160))).astype(np.uint16)
+    seeds = SeedGrid.from_frame(DepthFrame(depth, 0, 0, camera), (40, 40))
+    selector = NeuralGasSelector(150, 20, algorithm)
+    trained = selector.select(seeds)
+    again = selector.update(seeds)
+    moved = np.linalg.norm(again.nodes_mm - trained.nodes_mm, axis=1)
+    assert np.median(moved) < 0.5 * trained.quantisation_error_mm
+    assert again.quantisation_error_mm <= trained.quantisation_error_mm
+
+
 @st.composite
 def odd_seeds(draw) -> SeedGrid:
     """Seeds of a sensor without pinhole, in every degenerate arrangement."""
