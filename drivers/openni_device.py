@@ -88,9 +88,17 @@ class _Count:
 class OpenNIDevice(DepthSource):
     """A live depth sensor: the newest frame wins.
 
-    A supervisor thread takes the frames in and notices what OpenNI2 does not report: a stall,
-    a plug pulled out, a crash, a hang, frames of the wrong size. It then opens the sensor
-    again with the same settings, for as long as it takes; `state` tells how it stands.
+    A supervisor thread takes the frames in and notices what OpenNI2 does not report. It opens
+    the sensor again with the same settings, for as long as it takes, with pauses that grow to
+    1.5 s; `state` tells how it stands, and `read` raises a named error meanwhile.
+
+    ======================  =======================================================
+    no frame for 1 s        ``"stalled"``; after 3 s it is opened afresh
+    unplugged               ``"lost"`` until there is a sensor of its kind again
+    driver crashes          ``"reconnecting"``
+    driver hangs for 2 s    ``"reconnecting"``; its process is killed
+    frames of a wrong size  thrown away; after 15 in a row ``"reconnecting"``
+    ======================  =======================================================
 
     Parameters
     ----------
