@@ -28,7 +28,7 @@ Message = dict[str, Any]
 """What the worker says; its ``kind`` tells what else is in it."""
 
 _SLOTS = 4
-_SLOT_BYTES = 1280 * 1024 * 2  # the largest depth image that OpenNI2 knows; unused pages cost none
+_SLOT_BYTES = 1280 * 1024 * 2  # more than any sensor of this kind has; unused pages cost none
 _ERRORS = {kind.__name__: kind for kind in SourceError.__subclasses__()}
 
 
