@@ -22,7 +22,7 @@ from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.selection import Selection
 from selective_depth.selectors.windows import Windows, windows_of
 
-HALF_SCORE = 2e-4
+HALF_SCORE = 5e-4
 """Improvement, as a share of the mean depth of the seeds, that scores one half."""
 
 FloatMap = npt.NDArray[np.float32]

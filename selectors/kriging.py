@@ -256,7 +256,7 @@ def _improve(samples, count, u0, v0, width, height, frame_shape, scratch):  # ty
         raised = max(estimate[p], floor)
         estimate[p] = raised
         inverse[p] = np.float32(1.0) / raised
-        variance[p] = max(variance[p], tiny)
+        variance[p] = max(variance[p], np.float32(0.0))
     frame_height, frame_width = frame_shape
     if u0 < 1 or v0 < 1 or u0 + width >= frame_width or v0 + height >= frame_height:
         for row in range(height + 2):
@@ -280,10 +280,10 @@ def _improve(samples, count, u0, v0, width, height, frame_shape, scratch):  # ty
     above, under = inverse, inverse[2 * stride :]
     for p in range(size):
         around = to_left[p] * to_left[p] * left_of[p] + to_right[p] * to_right[p] * right_of[p]
-        result[p] = kept[p] * here[p] + around / kept[p]
+        result[p] = kept[p] * here[p] + around / max(kept[p], tiny)
     for p in range(size):
         around = to_above[p] * to_above[p] * above[p] + to_below[p] * to_below[p] * under[p]
-        result[p] += around / kept[p]
+        result[p] += around / max(kept[p], tiny)
     for i in range(count):
         row, column = v[i] - v0 + 1, u[i] - u0 + 1
         if 0 <= row < height + 2 and 0 <= column < stride:

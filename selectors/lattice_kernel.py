@@ -124,7 +124,7 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
             for n in range(LANES):
                 strip[0, row, column, batch, n] = np.float32(1.0) / inverse[p, n]
             for n in range(LANES):
-                strip[1, row, column, batch, n] = max(covariance[itself, n], tiny)
+                strip[1, row, column, batch, n] = max(covariance[itself, n], np.float32(0.0))
             for n in range(LANES):
                 to_left, to_right = covariance[beside, n], covariance[beside + 1, n]
                 around = to_left * to_left * inverse[p - 1, n]
@@ -133,9 +133,9 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
                 to_above, to_below = covariance[over, n], covariance[over + width, n]
                 around = to_above * to_above * inverse[p - stride, n]
                 around += to_below * to_below * inverse[p + stride, n]
-                kept = max(covariance[itself, n], tiny)
                 around += s[_AROUND + n]
-                strip[2, row, column, batch, n] = kept * inverse[p, n] + around / kept
+                kept = max(covariance[itself, n], np.float32(0.0))
+                strip[2, row, column, batch, n] = kept * inverse[p, n] + around / max(kept, tiny)
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")

@@ -120,13 +120,13 @@ def build_tables(geometries: list[tuple[int, int, int, int]], exponent: float) -
         return np.ascontiguousarray(whole, np.float32)
 
     def stacked(name: str) -> FloatArray:
-        return np.stack([part[name] for part in parts]).astype(np.float32)
+        return np.ascontiguousarray(np.stack([part[name] for part in parts]), np.float32)
 
     return LatticeTables(
         first_pixel=np.concatenate(([0], np.cumsum(pixels)[:-1])).astype(np.int64),
         first_pair=np.concatenate(([0], np.cumsum(pairs)[:-1])).astype(np.int64),
         distances=joined("distances", axis=1),
-        between=np.stack([part["between"] for part in parts]).astype(np.float64),
+        between=np.ascontiguousarray(np.stack([part["between"] for part in parts]), np.float64),
         vectors=joined("vectors"),
         is_seed=np.concatenate([part["is_seed"] for part in parts]).astype(np.bool_),
         products=joined("products"),
