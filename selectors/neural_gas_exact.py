@@ -32,10 +32,9 @@ def draw_nodes(
     float32 array of shape (nodes, 3)
     """
     count = len(points_mm)
-    chosen = rng.choice(count, nodes, replace=False) if nodes <= count else None
-    if chosen is None:
-        chosen = np.concatenate((np.arange(count), rng.integers(0, count, nodes - count)))
-    return points_mm[chosen]
+    if nodes <= count:
+        return points_mm[rng.choice(count, nodes, replace=False)]
+    return points_mm[np.concatenate((np.arange(count), rng.integers(0, count, nodes - count)))]
 
 
 def train_exact(
@@ -320,7 +319,8 @@ def _anneal(points, nodes, count, draws, lambda_first):  # type: ignore[no-untyp
     share = np.zeros((_MEMBERS, groups))
     flat_share = share.ravel()
     # Squared distance of the farthest node moved, per node moved, when a point was last drawn.
-    reaches = np.full(len(points), 1e33)
+    # At first everything is in reach but the padding.
+    reaches = np.full(len(points), 1e30)
     name = np.arange(size).astype(np.uint32)
     regroup_at = count // 2  # from here on only the groups near a point are looked at
     lanes = np.empty(64)
