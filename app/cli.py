@@ -190,6 +190,49 @@ def export(
 
 
 @command(
+    "Files",
+    (f"{PROGRAM} model frames/ model --frame 30 --budget 0.05", "a cloud, its depth, its samples"),
+)
+def model(
+    source: Source,
+    out: Annotated[Path, arg(metavar="DIR")],
+    /,
+    frame: Annotated[int, arg(metavar="N")] = 0,
+    budget: Annotated[float, arg(metavar="SHARE")] = 0.05,
+    rounds: Annotated[int, arg(metavar="N")] = 8,
+    seeds: SeedOptions = DEFAULTS.seeds,
+) -> None:
+    """Acquire one frame selectively and save the model: cloud.ply, depth.png, samples.npz.
+
+    Parameters
+    ----------
+    source : str
+        Anything that 'replay' takes.
+    out : Path
+        Folder for the three files.
+    frame : int
+        Which frame, from 0.
+    budget : float
+        Measurements beyond the seeds, as a share of the frame's pixels.
+    rounds : int
+        Rounds in which they are taken.
+    seeds
+        The seed lattice.
+    """
+    from selective_depth.app.export import save_model
+    from selective_depth.app.snapshot import nth_frame
+    from selective_depth.selectors.acquire import acquire
+    from selective_depth.selectors.seeds import SeedGrid
+
+    if frame < 0:
+        raise UsageError(f"--frame is {frame}; frames count from 0.")
+    full = nth_frame(source, frame)
+    grid = SeedGrid.from_frame(full, (seeds.rows, seeds.columns))
+    for path in save_model(out, acquire(full.measure, grid, budget, rounds), full.camera):
+        print(f"wrote {path}")
+
+
+@command(
     "Pictures",
     (f"{PROGRAM} screenshot out.rrd out.png", "the viewer on a recording that --save wrote"),
 )
