@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import tomllib
 from pathlib import Path
@@ -18,6 +19,7 @@ import cv2
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from virtual_sensor import VirtualSensor
 
 from selective_depth.app import cli, session
 from selective_depth.app.command import COMMANDS, SHELLS, parse
@@ -29,6 +31,7 @@ from selective_depth.app.settings import (
     to_toml,
 )
 
+ROOT = Path(__file__).parent.parent
 QUICK = ("--seeds.rows", "24", "--seeds.columns", "32", "--gas.nodes", "60", "--headless")
 ENDLESS = "virtual:ball?size=160x120&frames=1000000"
 
@@ -181,6 +184,26 @@ def test_settings_survive_the_round_trip(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 # Bad input: what people really have
+
+
+@pytest.mark.openni
+def test_cut_recording(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    whole = (ROOT / "recordings" / "workstation.oni").read_bytes()
+    (tmp_path / "cut.oni").write_bytes(whole[:300_000])
+    _, line = refuse(capsys, "replay", str(tmp_path / "cut.oni"), *QUICK)
+    assert "selective-depth check" in line
+
+
+@pytest.mark.openni
+def test_no_sensor(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, virtual_sensor: VirtualSensor
+) -> None:
+    virtual_sensor.set(connected=0)
+    for command in (["live"], ["record", str(tmp_path / "x.oni")]):
+        _, line = refuse(capsys, *command)
+        assert "no depth sensor" in line
+    assert cli.run(["devices"]) == 1
+    assert "no sensor found" in capsys.readouterr().out
 
 
 def test_missing_path(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -336,7 +359,7 @@ def test_served_replay_stays_for_viewers_on_this_machine_only(tmp_path: Path) ->
 
 @pytest.mark.openni
 def test_live_sensor_from_the_command_line(
-    virtual_sensor: object, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    virtual_sensor: VirtualSensor, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     out = tmp_path / "live.rrd"
     assert cli.run(["devices"]) == 0
@@ -383,3 +406,29 @@ def test_file_that_stops_growing_is_noticed_and_kept_readable(tmp_path: Path) ->
     assert "which are kept" in done.stderr
     assert "Traceback" not in done.stderr
     assert 0 < depth_rows(out) < 1000
+
+
+@pytest.mark.openni
+def test_unplugged_sensor_is_told_and_taken_up_again(
+    virtual_sensor: VirtualSensor, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "live.rrd"
+    pull = threading.Timer(2.5, lambda: virtual_sensor.set(connected=0))
+    plug = threading.Timer(3.5, lambda: virtual_sensor.set(connected=1))
+    for timer in (pull, plug):
+        timer.start()
+    assert cli.run(["live", *QUICK, "--frames", "120", "--save", str(out)]) == 0
+    pull.join()
+    plug.join()
+    errors = capsys.readouterr().err
+    assert errors.index("sensor lost") < errors.index("sensor live")
+    assert depth_rows(out) == 120
+    states = [
+        value
+        for chunk in RrdReader(str(out)).stream()
+        if chunk.entity_path == "/sensor/state" and not chunk.is_static
+        for row in chunk.to_record_batch().column("StateChange:state").to_pylist()
+        for value in row
+    ]
+    assert states[0] == states[-1] == "live"
+    assert "lost" in states

@@ -60,15 +60,14 @@ class Watched(DepthSource):
 def test_memory_files_and_threads_stay_flat(
     live: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    frames = FRAMES // 5 if live else FRAMES  # a live sensor takes its own time
-    uri = f"virtual:workstation?size=160x120&frames={frames}&live={int(live)}"
+    uri = f"virtual:workstation?size=160x120&frames={FRAMES}&live={int(live)}"
     source = Watched(open_source(uri))
     monkeypatch.setattr(session_module, "open_source", lambda _: source)
     settings = Settings(
         seeds=SeedOptions(48, 64),
         gas=GasOptions(nodes=500),
         acquire=AcquireOptions(budget=0.05),
-        run=RunOptions(frames=frames - frames // 10),
+        run=RunOptions(frames=FRAMES - FRAMES // 10),
         viewer=ViewerOptions(headless=True, save=tmp_path / "soak.rrd"),
     )
     session = Session(uri, settings)
