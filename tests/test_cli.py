@@ -31,6 +31,7 @@ from selective_depth.app.settings import (
     to_toml,
 )
 
+pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 ROOT = Path(__file__).parent.parent
 QUICK = ("--seeds.rows", "24", "--seeds.columns", "32", "--gas.nodes", "60", "--headless")
 ENDLESS = "virtual:ball?size=160x120&frames=1000000"
@@ -387,7 +388,6 @@ def test_interrupted_at_any_moment(tmp_path: Path, seed: int) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no file size limit on Windows")
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_file_that_stops_growing_is_noticed_and_kept_readable(tmp_path: Path) -> None:
     out = tmp_path / "out.rrd"
     limited = (
