@@ -330,7 +330,7 @@ class _StepPlan(Plan):
             if len(chosen) == shots or least <= 0:
                 self._threshold = worst
                 return chosen
-            least = least / 16 if least > self._rule.noise_mm**2 else np.float32(0)
+            least = least / 4 if least > self._rule.noise_mm**2 else np.float32(0)
 
     def _first_threshold(self, bound: Image, shots: int) -> np.float32:
         """A guess: what the last round ended at, or the tiles that could hold the best."""
