@@ -260,8 +260,8 @@ class Mesh:
         size = 2 * capacity
         tri, adj = np.empty((size, 3), np.int32), np.empty((size, 3), np.int32)
         extent_u, extent_v = (int(points[:n, i].max()) + 1 for i in (0, 1))
-        # One point a bin, on average: sparse points leave bins of 8 pixels empty.
-        bin_px = max(_BIN_PX, math.isqrt(extent_u * extent_v // n))
+        # Four points a bin, on average: sparse points leave bins of 8 pixels empty.
+        bin_px = max(_BIN_PX, math.isqrt(4 * extent_u * extent_v // n))
         side_u, side_v = (extent_u - 1) // bin_px + 1, (extent_v - 1) // bin_px + 1
         bins = np.zeros((side_v, side_u), np.int32)
         keys = np.empty(n, np.int64)
