@@ -59,7 +59,7 @@ class ImprovementSelector:
     ----------
     share : float, default 0.10
         Share of the known pixels that the mask selects, 0..1.
-    exponent : float, default 1.4
+    exponent : float, default 1.2
         The w = 2 - epsilon of eq. (24), in (0, 2).
     threads : int, optional
         Kernel threads; default `default_threads()`. The result does not depend on it.

@@ -67,8 +67,13 @@ def krige_row(  # type: ignore[no-untyped-def]
     z, row_of = samples[2], samples[3]
     for j in range(len(columns)):
         count = 0
-        for k in range(SEEDS):
-            count += padded[i + k // 3, j + k % 3] > 0
+        for k in range(3):
+            over, beside, under = (
+                padded[i, j + k] > 0,
+                padded[i + 1, j + k] > 0,
+                padded[i + 2, j + k] > 0,
+            )
+            count += over + beside + under
         held[place[j] // LANES, place[j] % LANES] = count if count > 1 else 0
     for batch in range(len(shape_of)):
         if held[batch].max() == SEEDS:
@@ -104,9 +109,9 @@ def krige_row(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def blend_down(
+def blend_down(  # type: ignore[no-untyped-def]
     share_one, one, row_one, held_one, share_other, other, row_other, held_other, mixed, held
-):  # type: ignore[no-untyped-def]
+):
     """Blend the same pixel row of two lattice rows' windows, weighted; place by place.
 
     `held` has three rows: the weight in all, and that of either window.

@@ -23,7 +23,7 @@ from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.semivariogram import fit_samples
 from selective_depth.selectors.windows import Windows, windows_over
 
-EXPONENT = 1.4
+EXPONENT = 1.2
 """The exponent w = 2 - epsilon of the semivariogram (eq. 24); see `app/docs/improvement.md`."""
 
 
@@ -74,7 +74,7 @@ def improvement_scattered(
     lattice : tuple of int, optional
         Rows and columns of the lattice of windows; default 128x128, or the frame's size where
         that is less. With the seeds' own lattice, seeds alone give the seeds' map.
-    exponent : float, default 1.4
+    exponent : float, default 1.2
         The w = 2 - epsilon of eq. (24), in (0, 2).
     threads : int, optional
         Kernel threads; default `default_threads()`. The result does not depend on it.

@@ -29,7 +29,10 @@ eq. (27): summing over five pixels costs less than its moments.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 MAX_SAMPLES = 32
@@ -56,7 +59,7 @@ def padded_pixels(width: int, height: int) -> int:
     return (width + 2) * (height + 3) + 2 * VECTOR
 
 
-def window_scratch(pixels: int):  # type: ignore[no-untyped-def]
+def window_scratch(pixels: int) -> tuple[npt.NDArray[Any], ...]:
     """Working memory of `krige_window` for windows of up to so many `padded_pixels`.
 
     One per thread. The first three arrays hold the results.
@@ -74,7 +77,7 @@ def window_scratch(pixels: int):  # type: ignore[no-untyped-def]
     )
 
 
-def sample_buffers():  # type: ignore[no-untyped-def]
+def sample_buffers() -> tuple[npt.NDArray[Any], ...]:
     """Columns, rows and depths of a window's samples, and their rows in a table of distances."""
     whole = np.zeros(MAX_SAMPLES, np.int64)
     return whole, whole.copy(), np.zeros(MAX_SAMPLES, np.float32), whole.copy()

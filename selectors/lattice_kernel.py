@@ -7,6 +7,7 @@ windows side by side; each inner loop runs over lanes and becomes vector instruc
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from selective_depth.selectors.lattice_tables import CONTRASTS, SEEDS
@@ -28,7 +29,7 @@ _AROUND = _FLOOR + LANES  # what a pixel's neighbours add to its improvement
 _ROWS_END = _AROUND + LANES
 
 
-def lattice_scratch(most_pixels: int):  # type: ignore[no-untyped-def]
+def lattice_scratch(most_pixels: int) -> tuple[npt.NDArray[np.float32], ...]:
     """Working memory of `krige_lanes` for windows of up to `most_pixels`; one per thread."""
     return (
         np.zeros(_ROWS_END, np.float32),

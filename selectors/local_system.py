@@ -14,7 +14,7 @@ import numpy.typing as npt
 from selective_depth.selectors.improvement_scattered import EXPONENT
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.semivariogram import fit_samples
-from selective_depth.selectors.windows import Axis, windows_of
+from selective_depth.selectors.windows import Axis, IntArray, windows_of
 
 NEIGHBOURS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])
 """Offsets (columns, rows) of the neighbourhood m of a pixel."""
@@ -55,7 +55,7 @@ def local_systems(seeds: SeedGrid, u: int, v: int, exponent: float = EXPONENT) -
         What the map was made from.
     u, v : int
         The pixel.
-    exponent : float, default 1.4
+    exponent : float, default 1.2
         The w = 2 - epsilon of eq. (24).
 
     Returns
@@ -65,9 +65,9 @@ def local_systems(seeds: SeedGrid, u: int, v: int, exponent: float = EXPONENT) -
     """
     windows = windows_of(seeds, exponent)
     height, width = seeds.frame_shape
-    neighbours = NEIGHBOURS + (u, v)
+    neighbours = np.array((u, v)) + NEIGHBOURS
     inside = (neighbours >= 0).all(axis=1) & (neighbours < (width, height)).all(axis=1)
-    found = []
+    found: list[tuple[float, float, float, IntArray, npt.NDArray[np.float64]]] = []
     for i, share_down in _centres(windows.rows, v):
         for j, share_across in _centres(windows.columns, u):
             box = np.s_[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]

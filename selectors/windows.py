@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -174,7 +175,7 @@ class Windows:
         return np.array(batches, np.int64), np.array(shape_of, np.int64), place
 
     @cached_property
-    def kernel_arguments(self) -> tuple[object, ...]:
+    def kernel_arguments(self) -> tuple[Any, ...]:
         """Everything about the lattice that `improvement_kernel.improvement_rows` takes."""
         rows, columns = self.rows, self.columns
         lanes_columns, shape_of, place = self.order

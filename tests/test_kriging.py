@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference_kriging import direct_improvement, gamma, krige
+
 from selective_depth.selectors.kriging import (
     MAX_SAMPLES,
     krige_window,
@@ -15,8 +17,6 @@ from selective_depth.selectors.kriging import (
 )
 from selective_depth.selectors.lattice_tables import build_tables
 from selective_depth.selectors.semivariogram import fit_moments, fit_samples, power_table
-
-from reference_kriging import direct_improvement, gamma, krige
 
 FRAME = (480, 640)
 
@@ -98,7 +98,7 @@ def test_samples_are_met_exactly_and_improve_nothing():
 def test_pixels_outside_the_frame_are_no_neighbours():
     uv = np.array([(3, 3), (8, 3), (3, 7)])
     depth = np.array([900, 950, 1400], np.float32)
-    z, variance, improvement = window(uv, depth, 5.0, 10.0, 1.4, 0, 0, 4, 4)
+    _, _, improvement = window(uv, depth, 5.0, 10.0, 1.4, 0, 0, 4, 4)
     corner, inside = np.array((0, 0)), np.array([(0, 0), (1, 0), (0, 1)])
     expected = direct_improvement(uv, depth.astype(float), corner, inside, 5.0, 10.0, 1.4)
     assert improvement[0, 0] == pytest.approx(expected, rel=1e-3)
@@ -174,7 +174,7 @@ def _eq27(p, depth, s, targets, a, b, w, *, corrected):
     the kriging terms come from w < 2, as the paper asks.
     """
     n = len(p)
-    weights, zs, variance = krige(p, depth, s[None], a, b, w)
+    _, zs, variance = krige(p, depth, s[None], a, b, w)
     _, z, _ = krige(p, depth, targets, a, b, w)
     K = np.ones((n + 1, n + 1))
     K[:n, :n] = gamma(p, p, a, b, w)
