@@ -451,6 +451,7 @@ def evaluate(
     jobs: Annotated[int | None, arg(metavar="N")] = None,
     json: Annotated[Path | None, arg(metavar="FILE")] = None,
     picture: Annotated[Path | None, arg(metavar="FILE.png")] = None,
+    page: Annotated[Path | None, arg(metavar="FILE.md")] = None,
 ) -> None:
     """Compare ways of choosing measurements: how good a model does a budget buy?
 
@@ -474,6 +475,8 @@ def evaluate(
         Processes; by default one per processor.
     json : Path
         Write the figures to a file as well.
+    page : Path
+        Write the tables in Markdown.
     picture : Path
         Write where each strategy shot and how wrong its model is, for the first frame.
     """
@@ -490,6 +493,7 @@ def evaluate(
         jobs=jobs,
         json_file=json,
         picture=picture,
+        page=page,
     )
 
 
@@ -584,4 +588,11 @@ def main() -> NoReturn:
     """Entry point of the console script."""
     # Asked to end by the system, leave as after Ctrl-C: sensor closed, files whole.
     signal.signal(signal.SIGTERM, _terminate)
-    sys.exit(run(sys.argv[1:]))
+    code = run(sys.argv[1:])
+    if code == INTERRUPTED:
+        # Everything is closed. What an import or a compiler was in the middle of must neither
+        # hold up the end nor change its exit code, as Python's own way out lets it.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)

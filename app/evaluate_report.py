@@ -15,7 +15,15 @@ from rich.console import Console
 from rich.table import Table
 
 from selective_depth.app.command import colours
-from selective_depth.app.evaluate import Outcome, Results, errors_of, outcomes, summarise
+from selective_depth.app.errors import UsageError
+from selective_depth.app.evaluate import (
+    Outcome,
+    Results,
+    errors_of,
+    frames_of,
+    outcomes,
+    summarise,
+)
 from selective_depth.app.progress import FrameProgress
 from selective_depth.app.stills import (
     ERROR_LIMIT_MM,
@@ -28,11 +36,11 @@ from selective_depth.app.stills import (
     _coloured,
     _hatched,
     finished,
-    save_png,
     write_text,
 )
 from selective_depth.app.strategies import STRATEGIES, Case
 from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.source import OutputError
 from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.reconstruct import reconstruct
 
@@ -59,8 +67,20 @@ def run_evaluation(
     jobs: int | None,
     json_file: Path | None,
     picture: Path | None,
+    page: Path | None = None,
 ) -> Results:
-    """Evaluate, show the table and write what was asked for."""
+    """Evaluate, show the table and write what was asked for.
+
+    Raises
+    ------
+    UsageError, OutputError
+        If a file cannot be written; found out before the work is done where possible.
+    """
+    if picture is not None and picture.suffix.lower() not in (".png", ".webp"):
+        raise UsageError(f"--picture is '{picture}'; pictures end in .png or .webp.")
+    for path in (json_file, picture, page):
+        if path is not None and not path.resolve().parent.is_dir():
+            raise OutputError(f"'{path}' cannot be written: its folder does not exist.")
     with FrameProgress("Evaluating", None) as bar:
         found = outcomes(
             sources,
@@ -78,16 +98,23 @@ def run_evaluation(
     print_results(results, count, rounds)
     if json_file is not None:
         document = {**results, "frames": [asdict(outcome) for outcome in found]}
-        json_file.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-        sys.stdout.write(f"wrote {json_file}\n")
+        _write(json_file, (json.dumps(document, indent=1) + "\n").encode())
+    if page is not None:
+        _write(page, to_markdown(found).encode())
     if picture is not None:
-        from selective_depth.app.evaluate import frames_of
-
         frame = next(frames_of(sources, every, 1))
         sheet = comparison(frame, budgets[0], rounds=rounds, seeds_shape=seeds_shape)
-        save_png(picture, sheet)
-        sys.stdout.write(f"wrote {picture}\n")
+        quality = [cv2.IMWRITE_WEBP_QUALITY, 75]
+        _write(picture, cv2.imencode(picture.suffix.lower(), sheet, quality)[1].tobytes())
     return results
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        path.write_bytes(data)
+    except OSError as error:
+        raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from None
+    sys.stdout.write(f"wrote {path}\n")
 
 
 def print_results(results: Results, frames: int, rounds: int) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from selective_depth.app import evaluate as protocol
-from selective_depth.app.cli import MISUSED, OK, run
+from selective_depth.app.cli import FAILED, MISUSED, OK, run
 from selective_depth.app.errors import UsageError
 from selective_depth.app.evaluate import Errors, Outcome, errors_of, outcomes, summarise
 from selective_depth.app.evaluate_report import comparison, to_markdown
@@ -172,7 +172,20 @@ def test_the_command_writes_table_file_and_picture(
     out, picture = tmp_path / "out.json", tmp_path / "out.png"
     words = ["evaluate", str(folder), "--budget", "0.05", "--rounds", "2", "--jobs", "1"]
     words += ["--seeds.rows", "32", "--seeds.columns", "32", "--random-seeds", "1"]
-    assert run([*words, "--json", str(out), "--picture", str(picture)]) == OK
+    assert (
+        run(
+            [
+                *words,
+                "--json",
+                str(out),
+                "--picture",
+                str(picture),
+                "--page",
+                str(tmp_path / "page.md"),
+            ]
+        )
+        == OK
+    )
     printed = capsys.readouterr().out
     document = json.loads(out.read_text())
     for name in STRATEGIES:
@@ -181,9 +194,12 @@ def test_the_command_writes_table_file_and_picture(
         assert {"geo", "worst", "share", "share_min", "rmse_mm", "mae_mm"} <= set(row)
     assert document["0.05"]["uniform"]["geo"] == pytest.approx(1)
     assert document["0.05"]["oracle"]["share"] == pytest.approx(1)
+    assert "(`loop`) |" in (tmp_path / "page.md").read_text()
     image = cv2.imread(str(picture))
     assert image is not None and image.shape[1] == 2000
     assert run(["evaluate", str(folder), "--budget", "2"]) == MISUSED
+    assert run(["evaluate", str(folder), "--picture", "out.gif"]) == MISUSED
+    assert run(["evaluate", str(folder), "--json", str(tmp_path / "no" / "out.json")]) == FAILED
 
 
 def test_the_picture_shows_shots_and_errors() -> None:
