@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from selective_depth.drivers.oni_file import inspect_oni
+from selective_depth.drivers.oni_rescue import mend_oni
 from selective_depth.drivers.openni_device import DeviceSettings
 from selective_depth.drivers.openni_process import Worker, error_of
 from selective_depth.drivers.openni_replay import OpenNIRecording
@@ -185,7 +186,7 @@ def _follow(worker: Worker, progress: Callable[[int], None] | None) -> tuple[str
 
 
 def _verify(path: Path, seen: int) -> tuple[int, str]:
-    """Count the frames of a finished recording, and have OpenNI2 itself open it again."""
+    """Tidy up a finished recording, count its frames, and have OpenNI2 itself open it again."""
     report = inspect_oni(path)
     frames = report.readable_frames
     if frames == 0:
@@ -198,6 +199,8 @@ def _verify(path: Path, seen: int) -> tuple[int, str]:
         )
     # The recorder leaves as many zeros after the end as there are bytes before it.
     os.truncate(path, report.size_bytes - report.tail_bytes)
+    # It also swaps two bytes of frames that end in a certain way; players would show that.
+    mend_oni(path)
     try:
         with OpenNIRecording(path) as recording:
             declared = recording.frame_count
