@@ -7,14 +7,20 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from selective_depth.app import interrupt
 from selective_depth.app.errors import UsageError
 from selective_depth.app.progress import FrameProgress, waiting
 from selective_depth.app.report import say
 from selective_depth.drivers.openni import list_devices, runtime_version
 from selective_depth.drivers.openni import record as record_oni
 from selective_depth.drivers.openni_runtime import find_runtime
+from selective_depth.drivers.openni_usb import usb_advice
 
-OK, FAILED, INTERRUPTED = 0, 1, 130
+UNKNOWN_ADVICE = (
+    "Is it plugged in and powered? A Kinect for Xbox 360 needs libfreenect's OpenNI2 driver beside"
+    " the others; see 'Attach a sensor' in the README."
+)
+OK, FAILED, INTERRUPTED = 0, 1, interrupt.EXIT_CODE
 
 
 def print_devices() -> int:
@@ -31,10 +37,7 @@ def print_devices() -> int:
     say(f"OpenNI2 {runtime_version()}, {runtime.library}")
     say(f"drivers: {', '.join(runtime.drivers) or 'none'}")
     if not found:
-        say(
-            "no sensor found. Is it plugged in and powered? A Kinect for Xbox 360 needs"
-            " libfreenect's OpenNI2 driver beside the others; see 'Attach a Kinect' in the README."
-        )
+        say(f"no sensor found. {usb_advice(runtime.drivers) or UNKNOWN_ADVICE}")
         return FAILED
     table = Table(box=None, pad_edge=False)
     for heading in ("device", "vendor", "name", "USB"):
@@ -59,6 +62,8 @@ def record_sensor(
     for option, value in (("--frames", frames), ("--seconds", seconds)):
         if value is not None and value <= 0:
             raise UsageError(f"{option} is {value}; it must be more than 0.")
+    interrupt.check()
+    interrupt.allow(interrupt.SAVE_S)
     with FrameProgress(f"Recording {out}", frames) as progress:
         report = record_oni(
             out,
