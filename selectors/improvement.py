@@ -101,7 +101,7 @@ class ImprovementSelector:
             histogram = np.zeros(1 << 15, np.int64)
             histograms.append(histogram)
             improvement_rows(
-                first_row, end_row, padded, half, *windows.kernel_arguments, _scratch(windows),
+                first_row, end_row, padded, half, windows.kernel_arguments, _scratch(windows),
                 histogram, (estimate, variance, raw, score, known),
             )  # fmt: skip
 

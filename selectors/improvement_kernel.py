@@ -215,20 +215,26 @@ def mark_known(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def improvement_rows(  # type: ignore[no-untyped-def]
-    first_row, end_row, padded, half, row_axis, column_axis, row_blend, column_blend, order,
-    places, tables, reach_squared, scratch, histogram, out,
-):  # fmt: skip
+    first_row, end_row, padded, half, lattice, scratch, histogram, out
+):
     """Map the pixel rows `first_row` to `end_row` - 1 of a frame.
 
     Parameters
     ----------
-    half : float
+    padded : float32 array of shape (R + 2, C + 2)
+        Depth of the seeds, 0 = missing, with a rim of zeros.
+    half : float32
         The improvement that scores one half.
+    lattice : tuple
+        `Windows.kernel_arguments`.
+    scratch : tuple
+        Working memory of this band.
     histogram : int64 array of shape (2^15,)
         Number of known pixels by the upper half of the bits of their improvement.
     out : tuple
         Estimate, variance, improvement, score and known of the frame.
     """
+    row_axis, column_axis, row_blend, column_blend, order, places, tables, reach_squared = lattice
     estimate, variance, raw, score, known = out
     samples, lattice_scratch, window_scratch, strips, helds, mixed, held, state = scratch
     frame_shape = estimate.shape

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.selectors.kriging import padded_pixels
+from selective_depth.selectors.kriging import MAX_PIXELS, padded_pixels
 from selective_depth.selectors.lattice_kernel import LANES
 from selective_depth.selectors.lattice_tables import LatticeTables, build_tables
 from selective_depth.selectors.seeds import SeedGrid, cell_centres
@@ -217,7 +217,16 @@ def _windows(frame_shape: tuple[int, int], rows: bytes, columns: bytes, exponent
     widest = max(
         int(a.max()) for axis in (row_axis, column_axis) for a in (axis.before, axis.after)
     )
-    return Windows(row_axis, column_axis, reach_px, power_table(exponent, 2 * widest + 2), exponent)
+    windows = Windows(
+        row_axis, column_axis, reach_px, power_table(exponent, 2 * widest + 2), exponent
+    )
+    if windows.most_pixels > MAX_PIXELS:
+        raise ValueError(
+            f"a lattice of {len(at_rows)}x{len(at_columns)} seeds on {height}x{width} pixels leaves"
+            f" windows of {windows.most_pixels} pixels; at most {MAX_PIXELS} are possible. Take"
+            f" more seeds, for example {min(64, height)}x{min(64, width)}."
+        )
+    return windows
 
 
 def windows_of(seeds: SeedGrid, exponent: float) -> Windows:

@@ -263,6 +263,11 @@ def test_scattered_samples_change_only_what_lies_near(shared_data):
     assert (part.raw[~where] == 0).all()
 
 
+def test_too_coarse_a_lattice_is_named():
+    with pytest.raises(ValueError, match="Take more seeds, for example 64x64"):
+        selected(np.full((480, 640), 1000, np.float32), (2, 2))
+
+
 def test_wrong_input_is_named():
     with pytest.raises(ValueError, match=r"share is 1\.5"):
         ImprovementSelector(share=1.5)
@@ -373,6 +378,6 @@ def test_best_tenth_holds_the_interpolation_error(shared_data, step):
         slope = np.where(found.known, np.hypot(*np.gradient(linear)), -1)
         best = np.argpartition(slope.ravel(), -found.mask.sum())[-found.mask.sum() :]
         gradient_shares.append(error.ravel()[best].sum() / error.sum())
-    print(f"improvement {np.mean(shares):.4f} (least {np.min(shares):.4f}),"
-          f" gradient {np.mean(gradient_shares):.4f} (least {np.min(gradient_shares):.4f})")  # fmt: skip
+    for name, held in (("improvement", shares), ("gradient", gradient_shares)):
+        print(f"{name}: {np.mean(held):.4f}, least {np.min(held):.4f}")
     assert np.mean(shares) >= 0.95
