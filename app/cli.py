@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Annotated, NoReturn
 
 from tyro.conf import arg
 
+from selective_depth.app import interrupt
 from selective_depth.app.command import (
     PROGRAM,
     command,
@@ -31,7 +31,7 @@ from selective_depth.app.settings import (
     optional,
 )
 
-OK, FAILED, MISUSED, INTERRUPTED = 0, 1, 2, 130
+OK, FAILED, MISUSED, INTERRUPTED = 0, 1, 2, interrupt.EXIT_CODE
 
 EXAMPLES = (
     (f"{PROGRAM} replay virtual:workstation", "a made scene, in the viewer"),
@@ -580,19 +580,10 @@ def _say(words: str) -> None:
     print(f"{PROGRAM}: {words}", file=sys.stderr)
 
 
-def _terminate(number: int, frame: object) -> NoReturn:
-    raise KeyboardInterrupt
-
-
 def main() -> NoReturn:
     """Entry point of the console script."""
-    # Asked to end by the system, leave as after Ctrl-C: sensor closed, files whole.
-    signal.signal(signal.SIGTERM, _terminate)
+    interrupt.install()
     code = run(sys.argv[1:])
     if code == INTERRUPTED:
-        # Everything is closed. What an import or a compiler was in the middle of must neither
-        # hold up the end nor change its exit code, as Python's own way out lets it.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+        interrupt.leave()
     sys.exit(code)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import os
 import threading
 import time
 from collections import deque
@@ -12,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
+from selective_depth.app import interrupt
 from selective_depth.app.errors import UsageError
 from selective_depth.app.loop import Loop
 from selective_depth.app.places import Viewer, has_display
@@ -34,9 +34,7 @@ from selective_depth.selectors.parallel import default_threads
 
 log = logging.getLogger(__name__)
 
-OK, FAILED, INTERRUPTED = 0, 1, 130
-LEAVE_S = 2.8
-"""How long after Ctrl-C the program is gone at the latest."""
+OK, FAILED, INTERRUPTED = 0, 1, interrupt.EXIT_CODE
 POLL_S = 0.5
 """How long a live sensor may be silent before its state is shown."""
 
@@ -150,7 +148,6 @@ class Session:
                     say("All frames are served; Ctrl-C ends.")
                     threading.Event().wait()
             except KeyboardInterrupt:
-                _leave_soon()
                 code = INTERRUPTED
             except DamagedRecordingError as error:
                 report.troubles.append(str(error))
@@ -193,6 +190,7 @@ class Session:
         """All frames; a live source that has none shows its state meanwhile."""
         state = _state(source)
         while True:
+            interrupt.check()
             frame = None
             try:
                 with loop.times.stage("read"):
@@ -259,13 +257,6 @@ def _tell(source: DepthSource) -> None:
         camera.cy,
         default_threads(),
     )
-
-
-def _leave_soon() -> None:
-    """See to it that Ctrl-C ends the program, even if a thread is busy compiling."""
-    watchdog = threading.Timer(LEAVE_S, os._exit, (INTERRUPTED,))
-    watchdog.daemon = True
-    watchdog.start()
 
 
 def _frames_in_all(limit: int | None, count: int | None) -> int | None:

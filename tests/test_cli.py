@@ -309,10 +309,11 @@ def test_real_sequence_is_saved_whole(shared_data: Path, tmp_path: Path) -> None
         np.testing.assert_array_equal(found[frame].reshape(depth_mm.shape), depth_mm)
 
 
-def interrupt(tmp_path: Path, after_s: float | None, number: int = signal.SIGINT) -> None:
-    """Stop an endless run, at once after `after_s` or once it has saved something."""
-    out = tmp_path / "out.rrd"
-    process = start("replay", ENDLESS, *QUICK, "--save", str(out), cwd=tmp_path)
+def interrupt(
+    out: Path, arguments: list[str], after_s: float | None, number: int = signal.SIGINT
+) -> tuple[str, str]:
+    """Stop an endless command after a time, or once it has saved something; return its output."""
+    process = start(*arguments, cwd=out.parent)
     deadline_s = time.monotonic() + (120 if after_s is None else after_s)
     while time.monotonic() < deadline_s and process.poll() is None:
         if after_s is None and out.exists() and out.stat().st_size > 300_000:
@@ -326,14 +327,15 @@ def interrupt(tmp_path: Path, after_s: float | None, number: int = signal.SIGINT
     assert process.returncode == 130, errors
     assert took_s < 3
     assert "Traceback" not in errors
-    if after_s is None:
-        assert "whole loop" in output
-        assert depth_rows(out) > 0
+    return output, errors
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_run_ends_soon_and_keeps_its_file(tmp_path: Path, number: int) -> None:
-    interrupt(tmp_path, None, number)
+    out = tmp_path / "out.rrd"
+    output, _ = interrupt(out, ["replay", ENDLESS, *QUICK, "--save", str(out)], None, number)
+    assert "whole loop" in output
+    assert depth_rows(out) > 0
 
 
 def test_served_replay_stays_for_viewers_on_this_machine_only(tmp_path: Path) -> None:
@@ -379,12 +381,24 @@ def test_live_sensor_from_the_command_line(
 
 
 @pytest.mark.slow
+@pytest.mark.openni
 @pytest.mark.parametrize("seed", range(50))
-def test_interrupted_at_any_moment(tmp_path: Path, seed: int) -> None:
-    interrupt(tmp_path, random.Random(seed).uniform(0.5, 6))
-    out = tmp_path / "out.rrd"
-    if out.exists() and out.stat().st_size:
+def test_interrupted_at_any_moment(
+    tmp_path: Path, seed: int, virtual_sensor: VirtualSensor
+) -> None:
+    out = tmp_path / ("out.oni" if seed % 3 == 2 else "out.rrd")
+    arguments = (
+        ["replay", ENDLESS, *QUICK, "--save", str(out)],
+        ["live", *QUICK, "--save", str(out)],
+        ["record", str(out)],
+    )[seed % 3]
+    interrupt(out, arguments, random.Random(seed).uniform(0.7, 6))
+    if not out.exists() or not out.stat().st_size:
+        return  # interrupted before there was anything to save
+    if out.suffix == ".rrd":
         depth_rows(out)
+    else:
+        assert cli.run(["check", str(out)]) == 0
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no file size limit on Windows")

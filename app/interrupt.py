@@ -1,0 +1,61 @@
+"""Ctrl-C that always works, within three seconds and whatever is going on.
+
+Python raises KeyboardInterrupt wherever it happens to be, and loses it where nothing may be
+raised: in a callback of an import, in a destructor. So it is noted as well, for the loop to
+look at; and if all else fails, a watchdog ends the program.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from typing import NoReturn
+
+EXIT_CODE = 130
+LEAVE_S = 2.8
+"""How long after Ctrl-C the program is gone at the latest."""
+SAVE_S = 15.0
+"""The same while a recording is being written, which must not be cut off."""
+
+_asked = threading.Event()
+_patience_s = LEAVE_S
+
+
+def install() -> None:
+    """Take Ctrl-C and the system's request to end, which is treated alike."""
+    signal.signal(signal.SIGINT, _on_signal)
+    signal.signal(signal.SIGTERM, _on_signal)
+
+
+def allow(seconds: float) -> None:
+    """Set how long what is going on may take to end."""
+    global _patience_s
+    _patience_s = seconds
+
+
+def check() -> None:
+    """Raise the KeyboardInterrupt that was asked for, should it have been lost."""
+    if _asked.is_set():
+        raise KeyboardInterrupt
+
+
+def leave() -> NoReturn:
+    """End at once, with all output said. Everything must be closed.
+
+    What an import or a compiler was in the middle of can neither hold this up nor change the
+    exit code, as it can with Python's own way out.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(EXIT_CODE)
+
+
+def _on_signal(number: int, frame: object) -> NoReturn:
+    if not _asked.is_set():
+        _asked.set()
+        watchdog = threading.Timer(_patience_s, os._exit, (EXIT_CODE,))
+        watchdog.daemon = True
+        watchdog.start()
+    raise KeyboardInterrupt
