@@ -10,7 +10,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -129,7 +128,7 @@ def print_results(results: Results, frames: int, rounds: int) -> None:
             " way from uniform to the oracle, mean and least; wrong: off by > 20 mm and > 2 %",
             caption_justify="left",
             padding=(0, 0, 0, 1),
-            box=SIMPLE_HEAD,
+            box=None,
         )
         shown.add_column("", no_wrap=True)
         for head in ("ratio", "worst", "share", "least", "RMSE", "MAE", "wrong", "missed"):
