@@ -88,8 +88,8 @@ def _with_a_place(options: ViewerOptions, uri: str) -> ViewerOptions:
     asked = options.save or options.serve or options.connect or options.headless
     if asked or has_display():
         return options
-    name = Path(uri.partition("?")[0].replace("virtual:", "").rstrip("/\\")).stem or "depth"
-    path = Path(f"{name.replace(':', '-')}.rrd")
+    path = Path("out", "live.rrd" if uri.startswith("openni") else "replay.rrd")
+    path.parent.mkdir(exist_ok=True)
     say(f"No display here: saving to {path} instead; open it with 'rerun {path}'.")
     return dataclasses.replace(options, save=path)
 

@@ -202,3 +202,21 @@ def test_failed_stage_is_not_counted() -> None:
     with pytest.raises(ValueError, match="bad"), times.stage("loop"):
         raise ValueError("bad")
     assert times.summary() == {}
+
+
+def test_without_a_display_the_run_is_saved(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(session_module, "has_display", lambda: False)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    settings = dataclasses.replace(SMALL, viewer=ViewerOptions())
+    code, _ = run(monkeypatch, Script([0, 1]), settings)
+    assert code == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "replay.rrd",
+        "replay.toml",
+        "replay.png",
+    }
+    assert "No display here" in capsys.readouterr().out
