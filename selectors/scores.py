@@ -191,6 +191,15 @@ def _score_tiles(
 
 
 @njit(cache=True, nogil=True)
+def _clear_tiles(score: Image, tiles: npt.NDArray[np.int64], tile_px: int) -> None:
+    """Forget the scores of some tiles."""
+    tile_columns = (score.shape[1] + tile_px - 1) // tile_px
+    for k in range(len(tiles)):
+        top, left = tiles[k] // tile_columns * tile_px, tiles[k] % tile_columns * tile_px
+        score[top : top + tile_px, left : left + tile_px] = 0
+
+
+@njit(cache=True, nogil=True)
 def _tile_bounds(low_mm: Image, high_mm: Image, gap_px: float, noise_mm2: float) -> Image:
     """Upper bound of the score in each tile, -1 where nothing is near enough to score."""
     rows, columns = low_mm.shape
@@ -309,6 +318,7 @@ class _StepPlan(Plan):
     def best(self, shots: int) -> npt.NDArray[np.int32]:
         samples = self._samples
         outdated = samples.stale & self._current
+        _clear_tiles(self._map, np.flatnonzero(outdated), samples.tile_px)
         self._current[outdated] = False
         samples.stale[:] = False
         bound = self._rule._bounds(samples)
@@ -323,7 +333,6 @@ class _StepPlan(Plan):
                 np.flatnonzero(wanted),
                 shots,
                 float(least),
-                self._current,
                 samples.tile_px,
                 self._threads,
             )
