@@ -16,6 +16,9 @@ from selective_depth.selectors.seeds import SeedGrid
 Measure = Callable[[npt.NDArray[np.int32]], npt.NDArray[np.generic]]
 """A random-access depth sensor: pixels (n, 2), column first, to depth (n,) in mm, 0 = none."""
 
+MOST_ROUNDS = 254
+"""Rounds are counted in a byte, and an image of them needs one value for "never"."""
+
 
 @dataclass(frozen=True)
 class Round:
@@ -42,7 +45,8 @@ class Acquisition:
     uv : int32 array of shape (n, 2)
         Pixels measured, column first, in the order of measuring; seeds first.
     depth_mm : uint16 array of shape (n,)
-        Depth; 0 = no return (kept: it was paid for, and it marks a hole).
+        Depth; 0 = no return (kept: it was paid for, and it marks a hole). float32 if the sensor
+        answers in floats.
     round : uint8 array of shape (n,)
         Round in which each was measured, 0 = seed.
     frame_shape : tuple of int
@@ -52,7 +56,7 @@ class Acquisition:
     """
 
     uv: npt.NDArray[np.int32]
-    depth_mm: npt.NDArray[np.uint16]
+    depth_mm: npt.NDArray[np.uint16] | npt.NDArray[np.float32]
     round: npt.NDArray[np.uint8]
     frame_shape: tuple[int, int]
     rounds: tuple[Round, ...]
@@ -106,7 +110,8 @@ def acquire(
     Parameters
     ----------
     measure : callable
-        The sensor: pixels (n, 2), column first, to depth (n,) in millimetres, 0 = no return.
+        The sensor: pixels (n, 2), column first, to depth (n,) in millimetres; 0, negative or
+        not finite = no return.
         It is asked for nothing but the chosen pixels, each at most once.
     seeds : SeedGrid
         The first measurements; they are not part of the budget.
@@ -126,20 +131,23 @@ def acquire(
         Seeds and shots. It may hold fewer shots than the budget, if there was nothing left
         near any sample.
     """
-    if rounds < 1:
-        raise ValueError(f"{rounds} rounds were asked for; at least 1 is needed")
+    if not 1 <= rounds <= MOST_ROUNDS:
+        raise ValueError(f"{rounds} rounds were asked for; give between 1 and {MOST_ROUNDS}")
     score = StepScore() if selector is None else selector
     shots = shots_of(budget, seeds.frame_shape)
     samples = Samples.of(seeds)
     plan = score.plan(samples, threads)
     lattice_uv = seeds.lattice_uv.reshape(-1, 2)
     lattice_mm = seeds.depth_mm.ravel()
-    uv, depth = [lattice_uv], [lattice_mm.astype(np.uint16)]
+    uv, depth, whole = [lattice_uv], [lattice_mm], True
     made: list[Round] = []
     for number in range(rounds):
         due = shots * (number + 1) // rounds - sum(r.shots for r in made)
         new_uv = plan.best(due)
-        new_mm = np.asarray(measure(new_uv))
+        answer = np.asarray(measure(new_uv))
+        new_mm = answer.astype(np.float32)
+        new_mm[~(np.isfinite(new_mm) & (new_mm > 0))] = 0
+        whole &= np.issubdtype(answer.dtype, np.integer)
         if new_mm.shape != (len(new_uv),):
             raise ValueError(
                 f"the sensor was asked for {len(new_uv)} pixels and answered with shape"
@@ -147,12 +155,13 @@ def acquire(
             )
         samples.add(new_uv, new_mm)
         uv.append(new_uv)
-        depth.append(new_mm.astype(np.uint16))
+        depth.append(new_mm)
         made.append(Round(len(new_uv), int(np.count_nonzero(new_mm))))
     counts = [len(part) for part in uv]
+    depth_mm: npt.NDArray[np.float32] = np.concatenate(depth)
     return Acquisition(
         np.concatenate(uv),
-        np.concatenate(depth),
+        depth_mm.astype(np.uint16) if whole else depth_mm,
         np.repeat(np.arange(len(uv), dtype=np.uint8), counts),
         seeds.frame_shape,
         tuple(made),

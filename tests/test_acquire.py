@@ -285,7 +285,7 @@ def test_budget_is_a_share_or_a_number() -> None:
 
 def test_misuse_is_refused_in_a_sentence() -> None:
     seeds = SeedGrid.from_array(scene(0), (10, 10))
-    with pytest.raises(ValueError, match="0 rounds were asked for; at least 1"):
+    with pytest.raises(ValueError, match="0 rounds were asked for; give between 1 and 254"):
         acquire(Sensor(scene(0)), seeds, 0.1, 0)
     with pytest.raises(ValueError, match="must return one depth per pixel"):
         acquire(lambda uv: np.zeros(3), seeds, 100, 1)
@@ -344,3 +344,16 @@ def test_it_is_worth_it_on_real_frames(shared_data: Path, folder: str, index: in
     uniform = rmse_mm(SeedGrid.from_array(depth, (154, 206)).lattice_uv.reshape(-1, 2))
     assert rmse_mm(acquire(Sensor(depth), seeds, 0.05, 1).uv) < 0.24 * uniform
     assert rmse_mm(acquire(Sensor(depth), seeds, 0.05, 8).uv) < 0.18 * uniform
+
+
+def test_a_sensor_that_reaches_far_and_answers_in_floats() -> None:
+    """A LiDAR's ranges do not fit in 16 bits; what did not return may be NaN."""
+    depth = scene(4).astype(np.float32) * 50
+    depth[depth == 0] = np.nan
+    seeds = SeedGrid.from_array(depth, (24, 26))
+    acquisition = acquire(lambda uv: depth[uv[:, 1], uv[:, 0]], seeds, 300, 3)
+    assert acquisition.depth_mm.dtype == np.float32
+    expected = np.nan_to_num(depth[acquisition.uv[:, 1], acquisition.uv[:, 0]])
+    np.testing.assert_array_equal(acquisition.depth_mm, expected)
+    assert acquisition.depth_mm.max() > 65535
+    assert sum(r.returned for r in acquisition.rounds) < 300 == acquisition.mask().sum()
