@@ -17,6 +17,8 @@ from selective_depth.drivers.source import (
 class RealtimeSource(DepthSource):
     """Paces another source by its timestamps; frames not read in time are lost and counted.
 
+    The clock starts when the second frame is asked for: with the first, a reader gets ready.
+
     Parameters
     ----------
     source : DepthSource
@@ -36,12 +38,15 @@ class RealtimeSource(DepthSource):
         self._newest: DepthFrame | None = None
         self._end: SourceError | None = None
         self._closing = threading.Event()
+        self._reads = 0
         self._thread = threading.Thread(target=self._play, name="realtime", daemon=True)
         self._thread.start()
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         """Return the newest frame that has not been read; see `DepthSource.read`."""
         with self._changed:
+            self._reads += 1
+            self._changed.notify_all()
             self._changed.wait_for(lambda: self._newest or self._end, timeout_s)
             if self._newest is not None:
                 frame, self._newest = self._newest, None
@@ -54,18 +59,22 @@ class RealtimeSource(DepthSource):
 
     def close(self) -> None:
         """Stop playing and close the recording."""
-        self._closing.set()
+        with self._changed:
+            self._closing.set()
+            self._changed.notify_all()
         self._thread.join()
         self._source.close()
 
     def _play(self) -> None:
-        start_s = start_us = None
         try:
+            first = self._source.read()
+            self._hand_over(first)
+            with self._changed:
+                self._changed.wait_for(lambda: self._reads > 1 or self._closing.is_set())
+            start_s = time.perf_counter()
             while not self._closing.is_set():
                 frame = self._source.read()
-                if start_s is None or start_us is None:
-                    start_s, start_us = time.perf_counter(), frame.timestamp_us
-                due_s = start_s + (frame.timestamp_us - start_us) / 1e6
+                due_s = start_s + (frame.timestamp_us - first.timestamp_us) / 1e6
                 if self._closing.wait(max(0.0, due_s - time.perf_counter())):
                     return
                 self._hand_over(frame)

@@ -140,14 +140,12 @@ class StepLogger:
 
     def _log_classes(self) -> None:
         log = self._stream.log
-        for path, label, colour in (
-            ("camera/holes", "no measurement", legend.HOLE),
-            ("camera/improvement/unknown", "too far from any sample", legend.HOLE),
-            ("camera/gas/mask", "kept triangles", legend.REGION),
-            ("camera/gas/complement", "long-edge triangles", legend.LONG_EDGE),
-        ):
-            classes = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, label, colour)])
-            log(path, classes, static=True)
+        nothing = (0, "", (0, 0, 0, 0))
+        hole = (1, "no measurement, or too far from one", legend.HOLE)
+        kept, long = (1, "kept triangles", legend.REGION), (2, "long edges", legend.LONG_EDGE)
+        # A class means what the nearest context above says: one for all, one for the regions.
+        log("camera", rr.AnnotationContext([nothing, hole]), static=True)
+        log("camera/gas", rr.AnnotationContext([nothing, kept, long]), static=True)
 
     def _log_sensor(self, step: Step) -> None:
         log, depth_mm, seeds = self._stream.log, step.frame.depth_mm, step.seeds
@@ -165,7 +163,7 @@ class StepLogger:
         log = self._stream.log
         log("camera/gas/mask", rr.SegmentationImage(regions.mask.view(np.uint8)))
         if self._options.detail:
-            complement = rr.SegmentationImage(regions.complement.view(np.uint8))
+            complement = rr.SegmentationImage(regions.complement.astype(np.uint8) * 2)
             log("camera/gas/complement", complement)
         nodes_uv, kept = regions.nodes_uv + CENTRE, regions.triangles[regions.kept]
         outlines = nodes_uv[kept[:, (0, 1, 2, 0)]]

@@ -146,12 +146,12 @@ def test_saved_run_writes_settings_and_picture_beside(
 
 def test_realtime_keeps_time_and_counts_what_nobody_read() -> None:
     with RealtimeSource(Script(list(range(12)))) as source:
-        first = source.read()
+        assert source.read().index == 0
         time.sleep(0.2)
-        second = source.read()
-        assert first.index == 0
-        assert second.index >= 4  # frames come every 33 ms
-        seen = 2
+        assert source.read().index == 1  # the clock starts here
+        time.sleep(0.2)
+        assert source.read().index >= 5  # frames come every 33 ms
+        seen = 3
         while True:
             try:
                 source.read()
