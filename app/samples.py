@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 
 from selective_depth.app.report import say
@@ -21,7 +20,8 @@ def bundled_recording() -> str:
     """
     from selective_depth.drivers.openni_runtime import find_runtime
 
-    folder = Path(str(files("selective_depth.recordings").joinpath("")))
+    # Beside `app` in the checkout as in the installed package.
+    folder = Path(__file__).parent.parent / "recordings"
     recording, twin = folder / f"{DEMO}.oni", folder / DEMO
     try:
         find_runtime()
