@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.selectors.improvement_kernel import best_threshold, improvement_rows
+from selective_depth.selectors.improvement_kernel import LEVELS, best_threshold, improvement_rows
 from selective_depth.selectors.improvement_scattered import EXPONENT
 from selective_depth.selectors.kriging import sample_buffers, window_scratch
 from selective_depth.selectors.lattice_kernel import LANES, lattice_scratch
@@ -92,13 +92,14 @@ class ImprovementSelector:
         maps = np.empty((4, *shape), np.float32)
         estimate, variance, raw, score = maps
         known = np.empty(shape, np.bool_)
-        padded = np.pad(np.asarray(seeds.depth_mm, np.float32), 1)
-        valid = padded[padded > 0]
-        half = np.float32(HALF_SCORE * valid.mean() if len(valid) else 1.0)
+        padded = np.zeros((seeds.shape[0] + 2, seeds.shape[1] + 2), np.float32)
+        padded[1:-1, 1:-1] = seeds.depth_mm
+        measured = np.count_nonzero(padded)
+        half = np.float32(HALF_SCORE * padded.sum(dtype=np.float64) / measured if measured else 1.0)
         histograms = []
 
         def band(first_row: int, end_row: int) -> None:
-            histogram = np.zeros(1 << 15, np.int64)
+            histogram = np.zeros((2, LEVELS), np.int32)
             histograms.append(histogram)
             improvement_rows(
                 first_row, end_row, padded, half, windows.kernel_arguments, _scratch(windows),
@@ -107,7 +108,7 @@ class ImprovementSelector:
 
         in_bands(band, shape[0], self.threads)
         wanted = int(self.share * np.count_nonzero(known))
-        threshold = best_threshold(raw.ravel(), sum(histograms), wanted)
+        threshold = best_threshold(raw.ravel(), sum(histograms).sum(axis=0), wanted)
         return ImprovementSelection(
             mask=raw >= threshold,
             score=score,
@@ -133,5 +134,5 @@ def _scratch(windows: Windows) -> tuple[object, ...]:
         np.zeros((2, batches, LANES), np.float32),
         np.zeros((3, widest, batches * LANES), np.float32),
         np.zeros((3, batches * LANES), np.float32),
-        np.zeros(len(columns.centres) + 1, np.uint8),
+        np.zeros((2, len(columns.centres) + 1), np.int64),
     )

@@ -11,6 +11,11 @@ from selective_depth.selectors.lattice_tables import SEEDS
 from selective_depth.selectors.semivariogram import fit_samples
 
 
+LEVEL_SHIFT = np.uint32(17)
+LEVELS = 1 << 14
+ONE = np.int32(1)
+
+
 @njit(cache=True, forceinline=True, nogil=True)
 def gather_seeds(padded, rows, columns, i, j, samples):  # type: ignore[no-untyped-def]
     """Collect the seeds of the window about lattice point (i, j), the centre first.
@@ -148,16 +153,19 @@ def blend_across(column_blend, places, mixed, held, estimate, variance, raw):  #
         raw[x] = one * flat_raw[j] + other * flat_raw[k]
 
 
-FAR, NEAR, MIXED = 0, 1, 2
+FAR, MIXED = 0, 1
 
 
 @njit(cache=True, forceinline=True, nogil=True)
-def judge_cells(i, padded, rows, columns, reach_squared, state):  # type: ignore[no-untyped-def]
-    """Judge the cells between lattice rows i and i + 1: known, unknown, or to be looked at.
+def judge_cells(i, padded, rows, columns, reach_squared, doubtful):  # type: ignore[no-untyped-def]
+    """List the cells between lattice rows i and i + 1 that are not known as a whole.
 
     Cell j lies between lattice columns j - 1 and j. A seed that returned depth makes known
     what lies within reach of it; seeds two lattice steps away or farther are not asked.
+    `doubtful` is filled with the numbers of the cells, and with FAR where nothing in them is
+    known or MIXED where each pixel is to be looked at; returned is how many they are.
     """
+    found = 0
     height = rows[i + 1] - rows[i] if 0 <= i < len(rows) - 1 else -1
     for j in range(len(columns) + 1):
         width = columns[j] - columns[j - 1] if 0 < j < len(columns) else -1
@@ -167,12 +175,17 @@ def judge_cells(i, padded, rows, columns, reach_squared, state):  # type: ignore
         for k in range(4):
             corners += padded[i + 1 + k // 2, j + k % 2] > 0
         # Every window that a pixel here lies in holds all corners; a system takes two samples.
-        state[j] = NEAR if corners >= 2 and small else MIXED
+        if corners >= 2 and small:
+            continue
+        state = MIXED
         if corners == 0:
             top, bottom = max(i, 0), min(i + 4, padded.shape[0])
             start, end = max(j - 1, 0), min(j + 3, padded.shape[1])
             if not (padded[top:bottom, start:end] > 0).any():
-                state[j] = FAR
+                state = FAR
+        doubtful[0, found], doubtful[1, found] = j, state
+        found += 1
+    return found
 
 
 @njit(cache=True, forceinline=True, nogil=True)
@@ -189,20 +202,19 @@ def near_seed(padded, rows, columns, i, j, y, x, reach_squared):  # type: ignore
 
 @njit(cache=True, forceinline=True, nogil=True)
 def mark_known(  # type: ignore[no-untyped-def]
-    y, i, padded, rows, columns, column_blend, places, reach_squared, held, state, estimate,
+    y, i, padded, rows, columns, column_blend, places, reach_squared, held, doubtful, estimate,
     variance, raw, known,
 ):  # fmt: skip
     """Tell known pixels of a row from those too far from every seed, and clear the latter."""
     _, _, _, _, first_weight, second_weight = column_blend
     first_place, second_place = places[0], places[1]
     known[:] = True
-    for j in range(len(columns) + 1):
-        if state[j] == NEAR:
-            continue
+    for n in range(doubtful.shape[1]):
+        j, state = doubtful[0, n], doubtful[1, n]
         start = columns[j - 1] if j > 0 else 0
         end = columns[j] if j < len(columns) else len(known)
         for x in range(start, end):
-            if state[j] == MIXED:
+            if state == MIXED:
                 total = first_weight[x] * held[first_place[x]]
                 total += second_weight[x] * held[second_place[x]]
                 if total > 0 and near_seed(padded, rows, columns, i, j, y, x, reach_squared):
@@ -229,14 +241,14 @@ def improvement_rows(  # type: ignore[no-untyped-def]
         `Windows.kernel_arguments`.
     scratch : tuple
         Working memory of this band.
-    histogram : int64 array of shape (2^15,)
-        Number of known pixels by the upper half of the bits of their improvement.
+    histogram : int32 array of shape (2, LEVELS)
+        Number of pixels by the upper bits of their improvement, in two parts.
     out : tuple
         Estimate, variance, improvement, score and known of the frame.
     """
     row_axis, column_axis, row_blend, column_blend, order, places, tables, reach_squared = lattice
     estimate, variance, raw, score, known = out
-    samples, lattice_scratch, window_scratch, strips, helds, mixed, held, state = scratch
+    samples, lattice_scratch, window_scratch, strips, helds, mixed, held, doubtful = scratch
     frame_shape = estimate.shape
     rows, columns = row_axis[0], column_axis[0]
     y_first, y_second, y_first_at, y_second_at, y_first_weight, y_second_weight = row_blend
@@ -244,6 +256,7 @@ def improvement_rows(  # type: ignore[no-untyped-def]
     flat_held = helds.reshape((2, -1))
     ready = -1
     judged = -2
+    doubts = 0
     for y in range(first_row, end_row):
         i, k = y_first[y], y_second[y]
         # Lattice row n is kept in slot n % 2 as long as it is needed.
@@ -260,17 +273,21 @@ def improvement_rows(  # type: ignore[no-untyped-def]
         blend_across(column_blend, places, mixed, held[0], estimate[y], variance[y], raw[y])
         above = i if rows[i] <= y else -1
         if judged != above:
-            judge_cells(above, padded, rows, columns, reach_squared, state)
+            doubts = judge_cells(above, padded, rows, columns, reach_squared, doubtful)
             judged = above
         mark_known(
-            y, above, padded, rows, columns, column_blend, places, reach_squared, held[0], state,
-            estimate[y], variance[y], raw[y], known[y],
+            y, above, padded, rows, columns, column_blend, places, reach_squared, held[0],
+            doubtful[:, :doubts], estimate[y], variance[y], raw[y], known[y],
         )  # fmt: skip
         for x in range(frame_shape[1]):
             score[y, x] = raw[y, x] / (raw[y, x] + half)
-        bits = raw[y].view(np.int32)
-        for x in range(frame_shape[1]):
-            histogram[bits[x] >> 16] += 1
+        # Two counts in turn: neighbours are alike, and the same count twice is a wait.
+        bits = raw[y].view(np.uint32)
+        for x in range(0, frame_shape[1] - 1, 2):
+            histogram[0, bits[x] >> LEVEL_SHIFT] += ONE
+            histogram[1, bits[x + 1] >> LEVEL_SHIFT] += ONE
+        if frame_shape[1] % 2:
+            histogram[0, bits[frame_shape[1] - 1] >> LEVEL_SHIFT] += ONE
 
 
 @njit(cache=True, nogil=True)
@@ -284,8 +301,8 @@ def best_threshold(raw, histogram, wanted):  # type: ignore[no-untyped-def]
     ----------
     raw : float32 array of shape (n,)
         Improvements, >= 0.
-    histogram : int64 array of shape (2^15,)
-        How many share the upper half of their bits: floats >= 0 are in the order of their bits.
+    histogram : int array of shape (LEVELS,)
+        How many share their upper bits: floats >= 0 are in the order of their bits.
     wanted : int
         How many pixels to take at most.
 
@@ -300,14 +317,14 @@ def best_threshold(raw, histogram, wanted):  # type: ignore[no-untyped-def]
         above += histogram[level]
         level -= 1
     edge = np.empty(1, np.int32)
-    edge[0] = (level + 1) << 16
+    edge[0] = (level + 1) << LEVEL_SHIFT
     if level == 0 or above == wanted:
         return edge.view(np.float32)[0]
     bits = raw.view(np.int32)
     group = np.empty(histogram[level], np.int32)
     count = 0
     for n in range(len(bits)):
-        if bits[n] >> 16 == level:
+        if bits[n] >> LEVEL_SHIFT == level:
             group[count] = bits[n]
             count += 1
     group.sort()

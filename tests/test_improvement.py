@@ -14,7 +14,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import cKDTree
 
 from selective_depth.selectors.improvement import ImprovementSelector
-from selective_depth.selectors.improvement_kernel import best_threshold
+from selective_depth.selectors.improvement_kernel import LEVEL_SHIFT, LEVELS, best_threshold
 from selective_depth.selectors.improvement_scattered import EXPONENT, improvement_scattered
 from selective_depth.selectors.seeds import SeedGrid
 
@@ -224,7 +224,7 @@ def test_threshold_takes_the_best_and_no_halves_of_ties(seed, share, ties):
     raw[rng.random(4000) < 0.3] = 0
     if ties:
         raw = np.round(raw, 0).astype(np.float32)
-    histogram = np.bincount(raw.view(np.int32) >> 16, minlength=1 << 15)
+    histogram = np.bincount(raw.view(np.int32) >> LEVEL_SHIFT, minlength=LEVELS)
     wanted = int(share * len(raw))
     mask = raw >= best_threshold(raw, histogram, wanted)
     assert mask.sum() <= wanted
