@@ -147,9 +147,13 @@ class DepthFrame:
 
     def __post_init__(self) -> None:
         depth = self.depth_mm
-        if not isinstance(depth, np.ndarray) or depth.dtype != np.uint16 or depth.ndim != 2:
-            got = getattr(depth, "dtype", type(depth).__name__), getattr(depth, "shape", ())
-            raise ValueError(f"depth_mm must be a uint16 array of shape (height, width), got {got}")
+        # Asked of the object: the annotation does not keep a caller from giving a list.
+        kind = getattr(depth, "dtype", type(depth).__name__)
+        shape = getattr(depth, "shape", ())
+        if kind != np.uint16 or len(shape) != 2:
+            raise ValueError(
+                f"depth_mm must be a uint16 array of shape (height, width), got {kind} {shape}"
+            )
         if depth.shape != (self.camera.height, self.camera.width):
             raise ValueError(
                 f"depth_mm has shape {depth.shape}, but the camera is {self.camera.height} rows"
@@ -178,4 +182,5 @@ class DepthFrame:
         uint16 array of shape (n,)
             Depth in millimetres, 0 = no return.
         """
-        return self.depth_mm[uv[:, 1], uv[:, 0]]
+        depth_mm: DepthArray = self.depth_mm[uv[:, 1], uv[:, 0]]
+        return depth_mm
