@@ -64,7 +64,8 @@ def test_commands_and_options_exist(help_of: dict[str, str]) -> None:
     everywhere = {"--help", "--version", "--completion", "--settings", "--debug", "--verbose"}
     seen = 0
     for page in PAGES:
-        for line in re.findall(r"^(?:\$ )?selective-depth .*$", page.read_text(), re.MULTILINE):
+        text = page.read_text().replace("\\\n", " ")
+        for line in re.findall(r"^(?:\$ )?selective-depth .*$", text, re.MULTILINE):
             words = shlex.split(line.removeprefix("$ "), comments=True)[1:]
             if words[0].startswith("-"):
                 assert words[0] in everywhere, f"{page.name}: {line}"
