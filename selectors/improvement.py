@@ -108,7 +108,7 @@ class ImprovementSelector:
 
         in_bands(band, shape[0], self.threads)
         wanted = int(self.share * np.count_nonzero(known))
-        threshold = best_threshold(raw.ravel(), sum(histograms).sum(axis=0), wanted)
+        threshold = best_threshold(raw.ravel(), np.sum(histograms, axis=(0, 1)), wanted)
         return ImprovementSelection(
             mask=raw >= threshold,
             score=score,

@@ -10,7 +10,6 @@ from selective_depth.selectors.lattice_kernel import LANES, krige_lanes
 from selective_depth.selectors.lattice_tables import SEEDS
 from selective_depth.selectors.semivariogram import fit_samples
 
-
 LEVEL_SHIFT = np.uint32(17)
 LEVELS = 1 << 14
 ONE = np.int32(1)
