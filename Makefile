@@ -56,6 +56,13 @@ recordings: $(VENV)/.tests-installed ## Make the recordings in recordings/ again
 	@.ci/system-packages $(TEST_PACKAGES)
 	@$(BIN)/python tests/make_recordings.py
 
+pictures: $(VENV)/.installed ## Make the pictures of the README and the documentation again
+	@.ci/system-packages libopenni2-0 libvulkan1 mesa-vulkan-drivers
+	@$(BIN)/selective-depth replay --headless --save out/viewer.rrd --budget 0.05 --rounds 4
+	@$(BIN)/selective-depth screenshot out/viewer.rrd app/docs/pictures/viewer.webp
+	@$(BIN)/selective-depth snapshot virtual:workstation virtual:ball virtual:firehose --out out/stills
+	@$(BIN)/python tests/make_virtual_docs.py
+
 wheel: $(VENV)/.installed ## Build dist/*.whl
 	@$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 

@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.table import Table
 
 from selective_depth.app.bench import BenchReport, bench, ratios
+from selective_depth.app.output import check_output, write_output
 from selective_depth.app.report import say
-from selective_depth.drivers.source import OutputError
 
 PAGE = """# Benchmark
 
@@ -52,17 +52,12 @@ def run_bench(
     OutputError
         If a file cannot be written.
     """
-    for path in (json, page):
-        if path is not None and not path.resolve().parent.is_dir():
-            raise OutputError(f"'{path}' cannot be written: its folder does not exist.")
+    check_output(json, page)
     report = bench(source, frames, peers=peers, say=lambda text: say(f"timing: {text} …"))
     print_bench(report)
     for path, text in ((json, report.to_json), (page, lambda: to_page(report))):
         if path is not None:
-            try:
-                path.write_text(text(), encoding="utf-8")
-            except OSError as error:
-                raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from error
+            write_output(path, text())
             say(f"wrote {path}")
 
 

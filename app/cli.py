@@ -249,14 +249,16 @@ def screenshot(
     recording : Path
         A Rerun recording, as --save writes it.
     picture : Path
-        The picture to make, 1920x1080.
+        The picture to make, .png or .webp, 1920x1080.
     frame : int
         The frame to show; by default the last.
     """
     from selective_depth.app import viewer
+    from selective_depth.app.output import check_picture, write_picture
     from selective_depth.app.report import say
 
-    viewer.screenshot(recording, picture, frame)
+    check_picture(picture)
+    write_picture(picture, viewer.screenshot(recording, frame))
     say(f"wrote {picture}")
     return OK
 

@@ -198,6 +198,12 @@ def _one_line(boxed: str, name: str) -> str:
     """What the parser drew as a box, as one sentence."""
     body = boxed.partition("For full helptext")[0].replace("(required)", "")
     words = " ".join(re.sub(r"╭.*╮|╰.*╯|[│─]", " ", body).split())
+    # Of a value of the wrong type the parser tells how it tried each type; the first line is it.
+    words = re.sub(
+        r"^Error parsing (\S+):.* instantiated from \['(.*?)'\]\..*",
+        r"\1 is '\2', which is no value for it",
+        words.partition(" Argument helptext:")[0],
+    )
     words = re.sub(rf"^Missing from {PROGRAM} {name}: ", "missing: ", words)
     return f"{words.rstrip('.')}. '{PROGRAM} {name} --help' shows what it takes."
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,7 +13,6 @@ from rich.console import Console
 from rich.table import Table
 
 from selective_depth.app.command import colours
-from selective_depth.app.errors import UsageError
 from selective_depth.app.evaluate import (
     Outcome,
     Results,
@@ -23,7 +21,9 @@ from selective_depth.app.evaluate import (
     outcomes,
     summarise,
 )
+from selective_depth.app.output import check_output, check_picture, write_output, write_picture
 from selective_depth.app.progress import FrameProgress
+from selective_depth.app.report import say
 from selective_depth.app.stills import (
     ERROR_LIMIT_MM,
     GAP,
@@ -39,7 +39,6 @@ from selective_depth.app.stills import (
 )
 from selective_depth.app.strategies import STRATEGIES, Case
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.source import OutputError
 from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.reconstruct import reconstruct
 
@@ -75,11 +74,8 @@ def run_evaluation(
     UsageError, OutputError
         If a file cannot be written; found out before the work is done where possible.
     """
-    if picture is not None and picture.suffix.lower() not in (".png", ".webp"):
-        raise UsageError(f"--picture is '{picture}'; pictures end in .png or .webp.")
-    for path in (json_file, picture, page):
-        if path is not None and not path.resolve().parent.is_dir():
-            raise OutputError(f"'{path}' cannot be written: its folder does not exist.")
+    check_picture(picture)
+    check_output(json_file, page)
     with FrameProgress("Evaluating", None) as bar:
         found = outcomes(
             sources,
@@ -97,23 +93,17 @@ def run_evaluation(
     print_results(results, count, rounds)
     if json_file is not None:
         document = {**results, "frames": [asdict(outcome) for outcome in found]}
-        _write(json_file, (json.dumps(document, indent=1) + "\n").encode())
+        write_output(json_file, json.dumps(document, indent=1) + "\n")
     if page is not None:
-        _write(page, to_markdown(found).encode())
+        write_output(page, to_markdown(found))
     if picture is not None:
         frame = next(frames_of(sources, every, 1))
         sheet = comparison(frame, budgets[0], rounds=rounds, seeds_shape=seeds_shape)
-        quality = [cv2.IMWRITE_WEBP_QUALITY, 75]
-        _write(picture, cv2.imencode(picture.suffix.lower(), sheet, quality)[1].tobytes())
+        write_picture(picture, sheet)
+    for path in (json_file, page, picture):
+        if path is not None:
+            say(f"wrote {path}")
     return results
-
-
-def _write(path: Path, data: bytes) -> None:
-    try:
-        path.write_bytes(data)
-    except OSError as error:
-        raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from None
-    sys.stdout.write(f"wrote {path}\n")
 
 
 def print_results(results: Results, frames: int, rounds: int) -> None:

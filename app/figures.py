@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.app.errors import UsageError
+from selective_depth.app.output import check_picture, write_output, write_picture
 from selective_depth.app.progress import waiting
 from selective_depth.app.report import say
 from selective_depth.app.snapshot import nth_frame
@@ -377,12 +378,12 @@ def draw_epochs(source: str, out: Path, *, save: Path | None, number: int, seed:
     UsageError
         If the picture is of a kind that cannot be made, or there is no such frame.
     """
-    _check_picture(out)
+    check_picture(out)
     frame = nth_frame(source, number)
     seeds = object_seeds(frame, FIRST_POINTS)
     with waiting(f"training {len(EPOCHS)} times"):
         trained = list(epoch_selections(seeds, EPOCHS, FIRST_NODES, seed))
-    _save_picture(out, epochs_figure(frame, seeds, trained))
+    write_picture(out, epochs_figure(frame, seeds, trained))
     say(f"wrote {out}")
     if save is not None:
         from selective_depth.app.viewer import save_trainings
@@ -394,11 +395,11 @@ def draw_epochs(source: str, out: Path, *, save: Path | None, number: int, seed:
 
 def draw_densities(source: str, out: Path, *, number: int, epochs: int, seed: int) -> int:
     """Make Fig. 2 of a frame of a source; returns the exit code. Raises as `draw_epochs`."""
-    _check_picture(out)
+    check_picture(out)
     frame = nth_frame(source, number)
     with waiting(f"training {len(DENSITIES)} times"):
         figure = densities_figure(frame, DENSITIES, epochs, seed)
-    _save_picture(out, figure)
+    write_picture(out, figure)
     say(f"wrote {out}")
     return 0
 
@@ -428,24 +429,5 @@ def tabulate_nodes(source: str, *, every: int | None, out: Path | None) -> int:
     table = table_markdown(rows)
     say(table)
     if out is not None:
-        try:
-            out.write_text(table, encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"'{out}' cannot be written: {error.strerror}.") from None
+        write_output(out, table)
     return 0
-
-
-def _check_picture(path: Path) -> None:
-    """Refuse before the work is done, not after."""
-    if path.suffix.lower() not in (".png", ".webp"):
-        raise UsageError(f"--out is '{path}'; pictures end in .png or .webp.")
-    if not path.resolve().parent.is_dir():
-        raise OutputError(f"'{path}' cannot be written: its folder does not exist.")
-
-
-def _save_picture(path: Path, image: Image) -> None:
-    _, data = cv2.imencode(path.suffix.lower(), image, [cv2.IMWRITE_WEBP_QUALITY, 85])
-    try:
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise OutputError(f"'{path}' cannot be written: {error.strerror}.") from None

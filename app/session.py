@@ -14,13 +14,14 @@ from pathlib import Path
 from selective_depth.app import interrupt
 from selective_depth.app.errors import UsageError
 from selective_depth.app.loop import Loop
+from selective_depth.app.output import write_picture
 from selective_depth.app.places import Viewer, has_display
 from selective_depth.app.progress import FrameProgress, waiting
 from selective_depth.app.realtime import RealtimeSource
 from selective_depth.app.report import RunReport, count_samples, print_report, save_settings, say
 from selective_depth.app.settings import Settings, ViewerOptions
 from selective_depth.app.step import StateNote, Step
-from selective_depth.app.stills import StillRow, contact_sheet, save_png
+from selective_depth.app.stills import StillRow, contact_sheet
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.source import (
     DamagedRecordingError,
@@ -238,7 +239,7 @@ class Session:
                 step.acquisition,
             )
             beside.append(saved.with_suffix(".png"))
-            save_png(beside[2], contact_sheet([row]))
+            write_picture(beside[2], contact_sheet([row]))
         self.report.written += beside
 
 

@@ -37,7 +37,7 @@ class GasOptions:
     epochs: int = 50
     """Passes over the seeds of the exact training."""
     algorithm: Literal["exact", "fast"] = "fast"
-    """Cold training: the published steps, or one as good and a hundred times as quick."""
+    """Cold training: the published steps, or one with no larger error in a fraction of the time."""
     training: Literal["live", "cold"] = "live"
     """Go on from the last frame's nodes, or train every frame from nothing."""
     seed: int = 0
@@ -54,7 +54,7 @@ class ImprovementOptions:
 
     share: float = 0.10
     """Share of the known pixels that the mask selects, 0..1."""
-    exponent: float = 1.4
+    exponent: float = 1.2
     """Exponent w = 2 - epsilon of the semivariogram, eq. (24); between 0 and 2."""
 
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from selective_depth.app.errors import UsageError
+from selective_depth.app.loop import Loop
+from selective_depth.app.output import write_picture
 from selective_depth.app.settings import Settings
-from selective_depth.app.stills import StillRow, contact_sheet, panels, save_png
+from selective_depth.app.stills import StillRow, contact_sheet, panels
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.source import OutputError, SourceEndedError, open_source
-from selective_depth.selectors.acquire import acquire
-from selective_depth.selectors.improvement import ImprovementSelector
-from selective_depth.selectors.neural_gas import NeuralGasSelector
-from selective_depth.selectors.seeds import SeedGrid
 
 
 def short_name(uri: str) -> str:
@@ -44,26 +43,11 @@ def nth_frame(uri: str, number: int) -> DepthFrame:
 
 def still_row(frame: DepthFrame, title: str, settings: Settings) -> StillRow:
     """Run both selectors, and the acquisition where there is a budget, on one frame."""
-    seeds = SeedGrid.from_frame(frame, (settings.seeds.rows, settings.seeds.columns))
-    gas, spend = settings.gas, settings.acquire
-    selector = NeuralGasSelector(
-        nodes=gas.nodes,
-        epochs=gas.epochs,
-        algorithm=gas.algorithm,
-        seed=gas.seed,
-        edge_metric=gas.edge_metric,
-        factor=gas.factor,
-    )
-    acquisition = None
-    if spend.budget:
-        acquisition = acquire(frame.measure, seeds, spend.budget, rounds=spend.rounds)
-    return StillRow(
-        title=title,
-        frame=frame,
-        regions=selector.select(seeds),
-        improvement=ImprovementSelector(share=settings.improvement.share).select(seeds),
-        acquisition=acquisition,
-    )
+    # One frame has no frame before it to go on from.
+    cold = replace(settings, gas=replace(settings.gas, training="cold"))
+    with Loop(cold) as loop:
+        step = loop.turn(frame)
+    return StillRow(title, frame, step.regions, step.improvement, step.acquisition)
 
 
 def snapshot(sources: Sequence[str], number: int, folder: Path, settings: Settings) -> list[Path]:
@@ -94,14 +78,14 @@ def snapshot(sources: Sequence[str], number: int, folder: Path, settings: Settin
     written = [folder / "sheet.png"]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        save_png(written[0], contact_sheet(rows))
-        for row in rows:
-            for panel in panels(row):
-                path = folder / f"{row.title}-{panel.name}.png"
-                save_png(path, panel.image)
-                written.append(path)
     except OSError as error:
         raise OutputError(
-            f"'{folder}' cannot be written: {error.strerror or error}. Name another with --out."
+            f"'{folder}' cannot be made: {error.strerror}. Name another with --out."
         ) from error
+    write_picture(written[0], contact_sheet(rows))
+    for row in rows:
+        for panel in panels(row):
+            path = folder / f"{row.title}-{panel.name}.png"
+            write_picture(path, panel.image)
+            written.append(path)
     return written

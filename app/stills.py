@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -268,7 +267,7 @@ def contact_sheet(rows: Sequence[StillRow], width: int = SHEET_WIDTH) -> Image:
     Returns
     -------
     uint8 array of shape (height, width, 3)
-        Blue-green-red, ready for `save_png`.
+        Blue-green-red, ready for `write_picture`.
     """
     strips = []
     for row in rows:
@@ -296,17 +295,3 @@ def _legend(strip: Image) -> None:
     left = write_text(strip, "kept triangles (edges ≤ mean)", left + 62, 26, 15, colour=PALE)
     cv2.circle(strip, (left + 36, 20), 4, NODE, -1, cv2.LINE_AA)
     write_text(strip, "neural-gas node", left + 48, 26, 15, colour=PALE)
-
-
-def save_png(path: Path, image: Image) -> None:
-    """Write a picture.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written, saying why.
-    """
-    done, data = cv2.imencode(".png", image)
-    if not done:
-        raise OSError(f"could not encode '{path}' as PNG")
-    path.write_bytes(data.tobytes())

@@ -533,17 +533,20 @@ def viewer_executable() -> str | None:
 # Pictures of it
 
 
-def screenshot(recording: Path, picture: Path, frame: int | None = None) -> None:
-    """Show a recording in an invisible viewer and take its picture, 1920x1080.
+def screenshot(recording: Path, frame: int | None = None) -> npt.NDArray[np.uint8]:
+    """Show a recording in an invisible viewer and take its picture.
 
     Parameters
     ----------
     recording : Path
         An .rrd that `--save` wrote.
-    picture : Path
-        PNG to write.
     frame : int, optional
         Frame to show; default the last.
+
+    Returns
+    -------
+    uint8 array of shape (1080, 1920, 3)
+        The window, blue-green-red.
 
     Raises
     ------
@@ -574,6 +577,12 @@ def screenshot(recording: Path, picture: Path, frame: int | None = None) -> None
         if frame is not None:
             client.set_time("frame", sequence=frame)
             time.sleep(2)
-        client.save_screenshot(str(picture.resolve()))
+        with tempfile.TemporaryDirectory() as folder:
+            picture = Path(folder) / "window.png"
+            client.save_screenshot(str(picture))
+            taken = cv2.imread(str(picture))
     finally:
         client.quit()
+    if taken is None:
+        raise ViewerError("the viewer made no picture. Look at the recording with 'rerun' instead.")
+    return np.asarray(taken, dtype=np.uint8)

@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from test_virtual import plane_residuals
 
-from selective_depth.app.stills import GAP, Panel, depth_panel, finished, save_png
+from selective_depth.app.output import write_picture
+from selective_depth.app.stills import GAP, Panel, depth_panel, finished
 from selective_depth.drivers.source import open_source
 from selective_depth.drivers.virtual_scenes import SCENES
 
@@ -55,7 +56,7 @@ def row(name: str, frames: list[npt.NDArray[np.uint16]]) -> str:
 
 
 def main() -> None:
-    save_png(PICTURE, picture())
+    write_picture(PICTURE, picture())
     print("| frames | error, steps | likeness 1, 2, 3 px apart | holes a frame | pixels lost |")
     print("|---|---|---|---|---|")
     real = sorted((ROOT.parent / "shared" / "data" / "sequence").glob("*.png"))[::10]

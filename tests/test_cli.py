@@ -446,3 +446,19 @@ def test_unplugged_sensor_is_told_and_taken_up_again(
     ]
     assert states[0] == states[-1] == "live"
     assert "lost" in states
+
+
+def test_defaults_on_the_command_line_are_the_selectors_own() -> None:
+    import inspect
+
+    from selective_depth.app.settings import GasOptions, ImprovementOptions
+    from selective_depth.selectors.improvement import ImprovementSelector
+    from selective_depth.selectors.neural_gas import NeuralGasSelector
+
+    for options, selector in (
+        (GasOptions(), NeuralGasSelector),
+        (ImprovementOptions(), ImprovementSelector),
+    ):
+        for name, parameter in inspect.signature(selector).parameters.items():
+            if name != "threads":
+                assert getattr(options, name) == parameter.default, name
