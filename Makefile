@@ -27,7 +27,7 @@ $(VENV)/.tests-installed: pyproject.toml $(VENV)/.installed
 
 run: $(VENV)/.installed ## Replay the bundled recording: a viewer, or files where there is no display
 	@.ci/system-packages libopenni2-0 || echo "Going on without: the recording's PNG twin is replayed instead."
-	@$(BIN)/selective-depth replay
+	@$(BIN)/selective-depth replay --budget 0.05 --rounds 4
 
 test: $(VENV)/.tests-installed ## Run the whole suite (the long forms: make test-slow)
 	@.ci/system-packages $(TEST_PACKAGES) || echo "Going on without: the tests that need them are skipped."

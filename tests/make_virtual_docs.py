@@ -32,7 +32,7 @@ def panel(uri: str, caption: str) -> npt.NDArray[np.uint8]:
 
 def picture() -> npt.NDArray[np.uint8]:
     rows = []
-    for noise, told in (("off", "exact"), ("kinect", "as a Kinect reports it")):
+    for noise, told in (("off", "exact"), ("kinect", "as sensed")):
         parts = [
             panel(f"virtual:{scene}?seed=7&noise={noise}", f"{scene}, {told}") for scene in SCENES
         ]
