@@ -68,5 +68,7 @@ def write_picture(path: Path, image: npt.NDArray[np.uint8]) -> None:
     OutputError
         If that fails, saying why.
     """
-    _, data = cv2.imencode(path.suffix.lower(), image, [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY])
+    kind = path.suffix.lower()
+    options = [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY] if kind == ".webp" else []
+    _, data = cv2.imencode(kind, image, options)
     write_output(path, data.tobytes())
