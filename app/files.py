@@ -98,7 +98,8 @@ def _save(
 
 def _print_check(report: OniReport) -> None:
     console = Console(highlight=False)
-    table = Table(title=str(report.path), title_justify="left", box=None, pad_edge=False)
+    console.print(str(report.path), soft_wrap=True)
+    table = Table(box=None, pad_edge=False, show_header=False)
     for justify in ("left", "right", "left"):
         table.add_column("", justify=justify)
     table.add_row("size", f"{report.size_bytes:,}", "bytes")

@@ -92,7 +92,8 @@ def say(sentence: str) -> None:
 def print_report(report: RunReport) -> None:
     """Print the table of a run on standard output; without colours if that is no terminal."""
     console = Console(highlight=False)
-    table = Table(title=report.source, title_justify="left", box=None, pad_edge=False)
+    console.print(report.source, soft_wrap=True)  # a table would break a long path
+    table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column("")
     table.add_column("", justify="right")
     table.add_column("")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from test_viewer import Listener
 
 from selective_depth.app import session as session_module
 from selective_depth.app.session import Session
@@ -25,6 +27,7 @@ from selective_depth.drivers.source import DepthSource, open_source
 
 FRAMES = int(os.environ.get("SOAK_FRAMES", "10000"))
 SETTLED = 500
+STOPPED_S = 30.0
 STATM = Path("/proc/self/statm")
 
 
@@ -83,3 +86,44 @@ def test_memory_files_and_threads_stay_flat(
     assert source.files[-1] <= source.files[SETTLED], "files are left open"
     assert source.threads[-1] <= source.threads[SETTLED], "threads are left running"
     assert source.megabytes[-1] < 600
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
+def test_a_viewer_stopped_for_half_a_minute_slows_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both selectors on a live source, saved and sent to a viewer that is stopped meanwhile."""
+    source = Watched(open_source("virtual:workstation?size=320x240&live=1"))
+    monkeypatch.setattr(session_module, "open_source", lambda _: source)
+    listener = Listener()
+    viewer = listener.process
+    stop = threading.Timer(15.0, viewer.send_signal, (signal.SIGSTOP,))
+    resume = threading.Timer(15.0 + STOPPED_S, viewer.send_signal, (signal.SIGCONT,))
+    settings = Settings(
+        run=RunOptions(frames=30 * int(20 + STOPPED_S)),
+        viewer=ViewerOptions(
+            headless=True,
+            save=tmp_path / "soak.rrd",
+            connect=f"rerun+http://127.0.0.1:{listener.port}/proxy",
+        ),
+    )
+    try:
+        stop.start()
+        resume.start()
+        session = Session(source.uri, settings)
+        assert session.run() == 0
+    finally:
+        stop.cancel()
+        resume.cancel()
+        viewer.send_signal(signal.SIGCONT)
+        listener.kill()
+    gaps_s = np.diff(source.times_s[100:])
+    grown = max(source.megabytes) - source.megabytes[300]
+    print(
+        f"\n{1 / gaps_s.mean():.1f} frames/s, longest gap {gaps_s.max() * 1000:.0f} ms,"
+        f" {source.dropped} skipped, {session.report.missed}, {grown:+.0f} MB at most"
+    )
+    assert 1 / gaps_s.mean() > 29
+    assert max(session.report.missed.values()) > 20 * STOPPED_S, "the viewer was not stopped"
+    assert grown < 550, "memory grows with what the viewer does not take"
