@@ -61,6 +61,7 @@ pictures: $(VENV)/.installed ## Make the pictures of the README and the document
 	@$(BIN)/selective-depth replay --headless --save out/viewer.rrd --budget 0.05 --rounds 4
 	@$(BIN)/selective-depth screenshot out/viewer.rrd app/docs/pictures/viewer.webp
 	@$(BIN)/selective-depth snapshot virtual:workstation virtual:ball virtual:firehose --out out/stills
+	@$(BIN)/selective-depth evaluate "virtual:workstation?seed=7" --frames 1 --budget 0.05 --picture app/docs/pictures/evaluation.webp
 	@$(BIN)/python tests/make_virtual_docs.py
 
 wheel: $(VENV)/.installed ## Build dist/*.whl
