@@ -6,7 +6,7 @@ QUICK := not slow and not hardware and not browser
 TEST_PACKAGES := libopenni2-0 libopenni2-dev g++ libvulkan1 mesa-vulkan-drivers
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-slow lint format system-packages recordings pictures wheel clean
+.PHONY: help run test test-slow lint format system-packages recordings pictures wheel wheel-check clean
 
 help: ## Show this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -65,7 +65,14 @@ pictures: $(VENV)/.installed ## Make the pictures of the README and the document
 	@$(BIN)/python tests/make_virtual_docs.py
 
 wheel: $(VENV)/.installed ## Build dist/*.whl
+	@rm -rf dist build
 	@$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+
+wheel-check: wheel ## Install the wheel in an empty environment and replay its sample
+	@rm -rf out/wheel && mkdir -p out/wheel
+	@$(PYTHON) -m venv out/wheel/env
+	@out/wheel/env/bin/python -m pip install --quiet --disable-pip-version-check dist/selective_depth-*.whl
+	@cd out/wheel && env/bin/selective-depth replay --frames 3
 
 clean: ## Remove everything that was made
 	rm -rf $(VENV) .typing build dist out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
