@@ -18,6 +18,10 @@ from selective_depth.selectors.neural_gas import NeuralGasSelector
 from selective_depth.selectors.regions import RegionSelection
 from selective_depth.selectors.seeds import SeedGrid
 
+MODEL_EVERY = 6
+"""Of a sensor's frames, one in so many gets a dense model: at 30 frames/s, one of every frame
+would take most of a core, which the frames themselves need."""
+
 
 class Loop:
     """Both selectors and the acquisition, frame by frame, every stage timed.
@@ -27,8 +31,8 @@ class Loop:
     settings : Settings
         Options of the seeds, the selectors and the acquisition.
     every_model : bool, default True
-        Make the dense model of every frame. Otherwise a frame's model is made beside the
-        loop, and the frames that come meanwhile have none: a sensor does not wait.
+        Make the dense model of every frame. Otherwise that of every `MODEL_EVERY`-th is made
+        beside the loop, and the other frames have none: a sensor does not wait.
 
     Raises
     ------
@@ -59,6 +63,7 @@ class Loop:
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="neural-gas")
         self._modelling = ThreadPoolExecutor(1, thread_name_prefix="model")
         self._pending: Future[Model] | None = None
+        self._since_model = MODEL_EVERY
 
     def warm_up(self, frame: DepthFrame) -> None:
         """Compile the kernels, fill the tables and train the first nodes, untimed."""
@@ -108,9 +113,13 @@ class Loop:
             return None
         if self._every_model:
             return self._made(frame, acquisition)
+        self._since_model += 1
         done = self._pending if self._pending and self._pending.done() else None
-        if done or self._pending is None:
+        if done:
+            self._pending = None
+        if self._pending is None and self._since_model >= MODEL_EVERY:
             self._pending = self._modelling.submit(self._made, frame, acquisition)
+            self._since_model = 0
         return done.result() if done else None
 
     def _made(self, frame: DepthFrame, acquisition: Acquisition) -> Model:

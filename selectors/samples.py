@@ -28,6 +28,7 @@ def _record(
     tile_px: int,
 ) -> None:
     tile_rows, tile_columns = stale.shape
+    touched = np.zeros(stale.shape, np.bool_)
     for i in range(len(uv)):
         u, v, z = uv[i, 0], uv[i, 1], depth_mm[i]
         bits[v, (u >> 6) + 1] |= np.uint64(1) << np.uint64(u & 63)
@@ -38,9 +39,11 @@ def _record(
             high_mm[row, column] = max(high_mm[row, column], z)
         else:
             image_mm[v, u] = MISSED
-        for r in range(max(row - 1, 0), min(row + 2, tile_rows)):
-            for c in range(max(column - 1, 0), min(column + 2, tile_columns)):
-                stale[r, c] = True
+        touched[row, column] = True
+    for row in range(tile_rows):
+        for column in range(tile_columns):
+            if touched[row, column]:
+                stale[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = True
 
 
 def seed_pitch_px(seeds: SeedGrid) -> float:
@@ -68,8 +71,9 @@ class Samples:
         1.8 steps, at most 21: samples farther than this from a pixel have no say about it. (So
         much, on both sides of a tile, fits in one word of `bits`.)
     tile_px : int
-        Side of the square tiles in which changes and depth ranges are booked. Greater than
-        `vote_px`, so that a measurement matters to its own and the eight tiles around it only.
+        Side of the square tiles in which changes and depth ranges are booked: `vote_px`, rounded
+        up to whole blocks of 3x3 pixels. So a measurement matters to its own and the eight tiles
+        around it only.
     image_mm : float32 array of shape (H, W)
         Depth where a measurement returned, `MISSED` where one did not, 0 where none was made.
     bits : uint64 array of shape (H, words)
@@ -86,7 +90,7 @@ class Samples:
         self.pitch_px = pitch_px
         self.vote_px = min(math.ceil(1.8 * pitch_px), (_WORD - 1) // 3)
         self.reach_px = min(1.3 * pitch_px, self.vote_px)
-        self.tile_px = self.vote_px + 1
+        self.tile_px = 3 * math.ceil(self.vote_px / 3)
         tiles = -(-height // self.tile_px), -(-width // self.tile_px)
         self.image_mm = np.zeros(shape, np.float32)
         self.bits = np.zeros((height, (width + _WORD - 1) // _WORD + 2), np.uint64)

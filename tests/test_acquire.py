@@ -287,6 +287,8 @@ def test_misuse_is_refused_in_a_sentence() -> None:
     seeds = SeedGrid.from_array(scene(0), (10, 10))
     with pytest.raises(ValueError, match="0 rounds were asked for; give between 1 and 254"):
         acquire(Sensor(scene(0)), seeds, 0.1, 0)
+    with pytest.raises(ValueError, match="voters is 7; give between 1 and 6"):
+        StepScore(voters=7)
     with pytest.raises(ValueError, match="must return one depth per pixel"):
         acquire(lambda uv: np.zeros(3), seeds, 100, 1)
 
@@ -308,9 +310,9 @@ def test_samples_book_what_returned_and_what_did_not() -> None:
     samples.stale[:] = False
     samples.add(np.array([(69, 24), (3, 2)], np.int32), np.array([1500, 0]))
     assert samples.image_mm[24, 69] == 1500 and samples.image_mm[2, 3] == MISSED
-    assert samples.low_mm[2, 6] == samples.high_mm[2, 6] == 1500
+    assert samples.low_mm[2, 7] == samples.high_mm[2, 7] == 1500
     assert samples.low_mm[0, 0] > samples.high_mm[0, 0], "a miss has no depth"
-    assert samples.stale[1:, 5:].all() and samples.stale[:2, :2].all()
+    assert samples.stale[1:, 6:].all() and samples.stale[:2, :2].all()
     assert samples.stale.sum() == 8
     assert samples.bits[24, 2] == np.uint64(1) << np.uint64(5)
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from selective_depth.app import session as session_module
 from selective_depth.app import timing
-from selective_depth.app.loop import Loop
+from selective_depth.app.loop import MODEL_EVERY, Loop
 from selective_depth.app.realtime import RealtimeSource
 from selective_depth.app.session import Session
 from selective_depth.app.settings import (
@@ -112,6 +112,14 @@ def test_live_goes_on_through_stall_and_loss(monkeypatch: pytest.MonkeyPatch) ->
     code, session = run(monkeypatch, source)
     assert (code, session.report.frames) == (0, 4)
     assert session.report.live
+
+
+def test_a_live_loop_makes_the_model_of_some_frames_only() -> None:
+    settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, rounds=2))
+    with Loop(settings, every_model=False) as loop:
+        for index in range(3 * MODEL_EVERY):
+            loop.turn(make_frame(index))
+    assert 1 <= loop.times.summary()["model"].count <= 3
 
 
 def test_damaged_recording_ends_with_what_was_read(monkeypatch: pytest.MonkeyPatch) -> None:
