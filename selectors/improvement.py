@@ -8,6 +8,7 @@ and `app/docs/improvement.md` for every choice that the paper leaves open.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +16,8 @@ import numpy.typing as npt
 
 from selective_depth.selectors.improvement_kernel import LEVELS, best_threshold, improvement_rows
 from selective_depth.selectors.improvement_scattered import EXPONENT
-from selective_depth.selectors.kriging import sample_buffers, window_scratch
-from selective_depth.selectors.lattice_kernel import LANES, lattice_scratch
+from selective_depth.selectors.kriging import aligned_zeros, sample_buffers, window_scratch
+from selective_depth.selectors.lattice_kernel import lattice_scratch
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.selection import Selection
@@ -120,19 +121,38 @@ class ImprovementSelector:
         )
 
 
+class _Kept(threading.local):
+    """The working memory that a thread used last: frame after frame has the same lattice."""
+
+    windows: Windows | None = None
+    scratch: tuple[object, ...] = ()
+
+
+_kept = _Kept()
+
+
 def _scratch(windows: Windows) -> tuple[object, ...]:
-    """Working memory of `improvement_rows` for one band."""
+    """Working memory of `improvement_rows` for the calling thread."""
+    if _kept.windows is not windows:
+        _kept.scratch = _new_scratch(windows)
+        _kept.windows = windows
+    return _kept.scratch
+
+
+def _new_scratch(windows: Windows) -> tuple[object, ...]:
     rows, columns = windows.rows, windows.columns
     tallest = int((rows.before + rows.after).max()) - 1
     widest = int((columns.before + columns.after).max()) - 1
-    batches = len(windows.order[0])
+    places = windows.order[0].size
     return (
         sample_buffers(),
         lattice_scratch(windows.most_pixels),
         window_scratch(windows.most_pixels),
-        np.zeros((2, 3, tallest, widest, batches, LANES), np.float32),
-        np.zeros((2, batches, LANES), np.float32),
-        np.zeros((3, widest, batches * LANES), np.float32),
-        np.zeros((3, batches * LANES), np.float32),
+        # A cache line more than needed: at a power of two, one lane's pixels would all be kept
+        # in the same few places of the cache.
+        aligned_zeros(2, 3, tallest, widest, places + 16),
+        aligned_zeros(2, places),
+        aligned_zeros(3, widest, places),
+        aligned_zeros(3, places),
         np.zeros((2, len(columns.centres) + 1), np.int64),
     )

@@ -12,6 +12,7 @@ from selective_depth.selectors.semivariogram import fit_samples
 
 LEVEL_SHIFT = np.uint32(17)
 LEVELS = 1 << 14
+BLOCK = 64
 ONE = np.int32(1)
 
 
@@ -56,9 +57,9 @@ def krige_row(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    strip : float32 array of shape (3, rows of a window, columns of a window, batches, LANES)
+    strip : float32 array of shape (3, rows of a window, columns of a window, places or more)
         Filled with estimate, variance and improvement of each window's pixels.
-    held : float32 array of shape (batches, LANES)
+    held : float32 array of shape (places,)
         Filled with the number of samples that each window holds, 0 if it has no system.
     """
     rows, ups, downs, row_shapes = row_axis
@@ -78,9 +79,10 @@ def krige_row(  # type: ignore[no-untyped-def]
                 padded[i + 2, j + k] > 0,
             )
             count += over + beside + under
-        held[place[j] // LANES, place[j] % LANES] = count if count > 1 else 0
+        # One sample alone says nothing of how depth varies around it.
+        held[place[j]] = count if count > 1 else 0
     for batch in range(len(shape_of)):
-        if held[batch].max() == SEEDS:
+        if held[batch * LANES : (batch + 1) * LANES].max() == SEEDS:
             j = lanes_columns[batch, 0]
             geometry = row_shapes[i] * column_shape_count + shape_of[batch]
             krige_lanes(
@@ -88,15 +90,11 @@ def krige_row(  # type: ignore[no-untyped-def]
                 lattice_scratch, strip,
             )  # fmt: skip
     for j in range(len(columns)):
-        batch, lane = place[j] // LANES, place[j] % LANES
-        count = held[batch, lane]
-        if count == SEEDS:
+        at = place[j]
+        # What counts nothing need not be right: it is finite, by `krige_lanes` or from before.
+        if held[at] == SEEDS or held[at] == 0:
             continue
         width = lefts[j] + rights[j] - 1
-        # One sample alone says nothing of how depth varies around it.
-        if count == 0:
-            strip[:, :height, :width, batch, lane] = 0
-            continue
         gathered = gather_seeds(padded, rows, columns, i, j, samples)
         geometry = row_shapes[i] * column_shape_count + column_shapes[j]
         a, b = fit_samples(z, row_of, gathered, between[geometry])
@@ -107,9 +105,9 @@ def krige_row(  # type: ignore[no-untyped-def]
         for row in range(height):
             for column in range(width):
                 p = (row + 1) * (width + 2) + column + 1
-                strip[0, row, column, batch, lane] = window_scratch[0][p]
-                strip[1, row, column, batch, lane] = window_scratch[1][p]
-                strip[2, row, column, batch, lane] = window_scratch[2][p]
+                strip[0, row, column, at] = window_scratch[0][p]
+                strip[1, row, column, at] = window_scratch[1][p]
+                strip[2, row, column, at] = window_scratch[2][p]
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -251,8 +249,6 @@ def improvement_rows(  # type: ignore[no-untyped-def]
     frame_shape = estimate.shape
     rows, columns = row_axis[0], column_axis[0]
     y_first, y_second, y_first_at, y_second_at, y_first_weight, y_second_weight = row_blend
-    flat = strips.reshape((2, 3, strips.shape[2], strips.shape[3], -1))
-    flat_held = helds.reshape((2, -1))
     ready = -1
     judged = -2
     doubts = 0
@@ -266,8 +262,8 @@ def improvement_rows(  # type: ignore[no-untyped-def]
             )  # fmt: skip
             ready = n
         blend_down(
-            y_first_weight[y], flat[i % 2], y_first_at[y], flat_held[i % 2],
-            y_second_weight[y], flat[k % 2], y_second_at[y], flat_held[k % 2], mixed, held,
+            y_first_weight[y], strips[i % 2], y_first_at[y], helds[i % 2],
+            y_second_weight[y], strips[k % 2], y_second_at[y], helds[k % 2], mixed, held,
         )  # fmt: skip
         blend_across(column_blend, places, mixed, held[0], estimate[y], variance[y], raw[y])
         above = i if rows[i] <= y else -1
@@ -319,13 +315,22 @@ def best_threshold(raw, histogram, wanted):  # type: ignore[no-untyped-def]
     edge[0] = (level + 1) << LEVEL_SHIFT
     if level == 0 or above == wanted:
         return edge.view(np.float32)[0]
-    bits = raw.view(np.int32)
+    bits = raw.view(np.uint32)
+    level_bits = np.uint32(level)
     group = np.empty(histogram[level], np.int32)
     count = 0
-    for n in range(len(bits)):
-        if bits[n] >> LEVEL_SHIFT == level:
-            group[count] = bits[n]
-            count += 1
+    for start in range(0, len(bits), BLOCK):
+        block = bits[start : start + BLOCK]
+        # Most blocks hold none, and vector instructions find that out.
+        inside = np.int32(0)
+        for n in range(len(block)):
+            inside += np.int32(block[n] >> LEVEL_SHIFT == level_bits)
+        if inside == 0:
+            continue
+        for n in range(len(block)):
+            if block[n] >> LEVEL_SHIFT == level_bits:
+                group[count] = block[n]
+                count += 1
     group.sort()
     place = count - (wanted - above)
     edge[0] = group[place]

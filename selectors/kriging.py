@@ -29,6 +29,7 @@ eq. (27): summing over five pixels costs less than its moments.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,23 @@ VECTOR = 16
 
 def padded_pixels(width: int, height: int) -> int:
     """Room for a window's pixels, their rim, and what loops run over behind them."""
-    return (width + 2) * (height + 3) + 2 * VECTOR
+    room = (width + 2) * (height + 3) + 2 * VECTOR
+    return -(-room // VECTOR) * VECTOR
+
+
+def aligned_empty(*shape: int) -> npt.NDArray[np.float32]:
+    """Memory that begins on a cache line: vectors that lie across two are slower to load."""
+    count = math.prod(shape)
+    room = np.empty(count + VECTOR, np.float32)
+    start = -room.ctypes.data % 64 // room.itemsize
+    return room[start : start + count].reshape(shape)
+
+
+def aligned_zeros(*shape: int) -> npt.NDArray[np.float32]:
+    """`aligned_empty`, filled with zeros."""
+    zeros = aligned_empty(*shape)
+    zeros[...] = 0
+    return zeros
 
 
 def window_scratch(pixels: int) -> tuple[npt.NDArray[Any], ...]:
@@ -65,13 +82,13 @@ def window_scratch(pixels: int) -> tuple[npt.NDArray[Any], ...]:
     One per thread. The first three arrays hold the results.
     """
     return (
-        np.zeros(pixels, np.float32),  # estimate
-        np.zeros(pixels, np.float32),  # variance
-        np.zeros(pixels, np.float32),  # improvement
-        np.zeros(pixels, np.float32),  # 1 / estimate, 0 where it does not count
-        np.zeros(pixels, np.float32),  # covariance with the pixel to the right
-        np.zeros(pixels, np.float32),  # covariance with the pixel below
-        np.empty(MAX_SAMPLES * _STRIDE, np.float32),  # U
+        aligned_zeros(pixels),  # estimate
+        aligned_zeros(pixels),  # variance
+        aligned_zeros(pixels),  # improvement
+        aligned_zeros(pixels),  # 1 / estimate, 0 where it does not count
+        aligned_zeros(pixels),  # covariance with the pixel to the right
+        aligned_zeros(pixels),  # covariance with the pixel below
+        aligned_empty(MAX_SAMPLES * _STRIDE),  # U
         np.zeros((MAX_SAMPLES, MAX_SAMPLES), np.float64),  # L, its diagonal inverted
         np.zeros(MAX_SAMPLES, np.float64),  # L^-1 (Z - z_ref)
     )

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from selective_depth.selectors.kriging import aligned_zeros
 from selective_depth.selectors.lattice_tables import CONTRASTS, SEEDS
 
 LANES = 64
@@ -32,9 +33,9 @@ _ROWS_END = _AROUND + LANES
 def lattice_scratch(most_pixels: int) -> tuple[npt.NDArray[np.float32], ...]:
     """Working memory of `krige_lanes` for windows of up to `most_pixels`; one per thread."""
     return (
-        np.zeros(_ROWS_END, np.float32),
-        np.zeros((most_pixels, LANES), np.float32),  # 1 / estimate of each pixel
-        np.zeros((3 * most_pixels, LANES), np.float32),  # covariance of each pair
+        aligned_zeros(_ROWS_END),
+        aligned_zeros(most_pixels, LANES),  # 1 / estimate of each pixel
+        aligned_zeros(3 * most_pixels, LANES),  # covariance of each pair
     )
 
 
@@ -44,7 +45,7 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
 ):
     """Krige the windows of lattice row `i` in batch number `batch`.
 
-    Lanes whose window has a hole come out as nonsense and are to be overwritten.
+    Lanes whose window has a hole come out finite, but of no meaning.
 
     Parameters
     ----------
@@ -60,8 +61,8 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
         `LatticeTables.arrays`.
     scratch : tuple
         `lattice_scratch`.
-    strip : float32 array of shape (3, rows, columns, batches, LANES)
-        Filled with estimate, variance and improvement.
+    strip : float32 array of shape (3, rows, columns, places or more)
+        Filled with estimate, variance and improvement, this batch from place batch * LANES on.
     """
     (
         first_pixel, first_pair, _, _, vectors, is_seed, products, bases, basis, eigenvalues,
@@ -75,6 +76,7 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
 
     height, width = up + down - 1, left + right - 1
     stride = width + 2
+    first, end = batch * LANES, (batch + 1) * LANES
     pixel = first_pixel[geometry]
     for p in range((height + 2) * stride):
         if is_seed[pixel + p]:
@@ -111,11 +113,14 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
     for row in range(height):
         for column in range(width):
             p = (row + 1) * stride + column + 1
+            z_out = strip[0, row, column, first:end]
+            variance_out = strip[1, row, column, first:end]
+            improvement_out = strip[2, row, column, first:end]
             if is_seed[pixel + p]:
                 for n in range(LANES):
-                    strip[0, row, column, batch, n] = s[_CENTRE + n]
-                    strip[1, row, column, batch, n] = np.float32(0.0)
-                    strip[2, row, column, batch, n] = np.float32(0.0)
+                    z_out[n] = s[_CENTRE + n]
+                    variance_out[n] = np.float32(0.0)
+                    improvement_out[n] = np.float32(0.0)
                 continue
             itself = row * width + column
             beside = across + row * (width + 1) + column
@@ -123,9 +128,9 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
             # Three short loops: with more arrays in one, the compiler gives up proving that
             # they do not overlap.
             for n in range(LANES):
-                strip[0, row, column, batch, n] = np.float32(1.0) / inverse[p, n]
+                z_out[n] = np.float32(1.0) / inverse[p, n]
             for n in range(LANES):
-                strip[1, row, column, batch, n] = max(covariance[itself, n], np.float32(0.0))
+                variance_out[n] = max(covariance[itself, n], np.float32(0.0))
             for n in range(LANES):
                 to_left, to_right = covariance[beside, n], covariance[beside + 1, n]
                 around = to_left * to_left * inverse[p - 1, n]
@@ -136,7 +141,7 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
                 around += to_below * to_below * inverse[p + stride, n]
                 around += s[_AROUND + n]
                 kept = max(covariance[itself, n], np.float32(0.0))
-                strip[2, row, column, batch, n] = kept * inverse[p, n] + around / max(kept, tiny)
+                improvement_out[n] = kept * inverse[p, n] + around / max(kept, tiny)
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -154,6 +159,10 @@ def _fit_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
             least = min(least, z)
             s[_DEPTH + k * LANES + n] = z - centre
         s[_FLOOR + n] = np.float32(0.5) * least
+        if least == 0:  # nothing varies in a window with a hole, and nothing overflows
+            s[_CENTRE + n] = s[_FLOOR + n] = np.float32(1.0)
+            for k in range(SEEDS):
+                s[_DEPTH + k * LANES + n] = np.float32(0.0)
     for n in range(LANES):
         s[_MEAN + n] = np.float32(0.0)
     for k in range(SEEDS):

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.selectors.kriging import padded_pixels
+from selective_depth.selectors.kriging import aligned_empty, padded_pixels
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
@@ -117,7 +117,9 @@ def build_tables(geometries: list[tuple[int, int, int, int]], exponent: float) -
 
     def joined(name: str, axis: int = 0) -> FloatArray:
         whole = np.concatenate([part[name] for part in parts], axis=axis)
-        return np.ascontiguousarray(whole, np.float32)
+        kept = aligned_empty(*whole.shape)
+        kept[...] = whole
+        return kept
 
     def stacked(name: str) -> FloatArray:
         return np.ascontiguousarray(np.stack([part[name] for part in parts]), np.float32)
