@@ -18,7 +18,7 @@ from selective_depth.selectors.neural_gas import NeuralGasSelector
 from selective_depth.selectors.regions import RegionSelection
 from selective_depth.selectors.seeds import SeedGrid
 
-MODEL_EVERY = 6
+MODEL_EVERY = 10
 """Of a sensor's frames, one in so many gets a dense model: at 30 frames/s, one of every frame
 would take most of a core, which the frames themselves need."""
 
