@@ -97,11 +97,11 @@ class ImprovementSelector:
         padded[1:-1, 1:-1] = seeds.depth_mm
         measured = np.count_nonzero(padded)
         half = np.float32(HALF_SCORE * padded.sum(dtype=np.float64) / measured if measured else 1.0)
-        histograms = []
+        histograms: list[npt.NDArray[np.int32]] = []
 
         def band(first_row: int, end_row: int) -> None:
             histogram = np.zeros((2, LEVELS), np.int32)
-            histograms.append(histogram)
+            histograms.extend(histogram)
             improvement_rows(
                 first_row, end_row, padded, half, windows.kernel_arguments, _scratch(windows),
                 histogram, (estimate, variance, raw, score, known),
@@ -109,7 +109,7 @@ class ImprovementSelector:
 
         in_bands(band, shape[0], self.threads)
         wanted = int(self.share * np.count_nonzero(known))
-        threshold = best_threshold(raw.ravel(), np.sum(histograms, axis=(0, 1)), wanted)
+        threshold = best_threshold(raw.ravel(), sum(histograms), wanted)
         return ImprovementSelection(
             mask=raw >= threshold,
             score=score,
