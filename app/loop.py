@@ -41,7 +41,11 @@ class Loop:
     """
 
     def __init__(self, settings: Settings, *, every_model: bool = True) -> None:
-        gas, improvement, threads = settings.gas, settings.improvement, settings.run.threads
+        gas, improvement = settings.gas, settings.improvement
+        # Three stages side by side keep two cores busy with a thread each; with more, each
+        # would wait for parts of its work to get through behind parts of the others'.
+        threads = settings.run.threads or (1 if settings.acquire.budget else None)
+        self._threads = threads
         self.times = StageTimes()
         self._settings = settings
         self._live_gas = gas.training == "live"
@@ -58,9 +62,9 @@ class Loop:
             share=improvement.share, exponent=improvement.exponent, threads=threads
         )
         self._every_model = every_model
-        # The selectors are compiled and free of the GIL: side by side they take as long as
-        # the longer of them.
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="neural-gas")
+        # The stages are compiled and free of the GIL: side by side they take as long as the
+        # longest of them.
+        self._beside = ThreadPoolExecutor(2, thread_name_prefix="beside")
         self._modelling = ThreadPoolExecutor(1, thread_name_prefix="model")
         self._pending: Future[Model] | None = None
         self._since_model = MODEL_EVERY
@@ -76,10 +80,11 @@ class Loop:
             with self.times.stage("seeds"):
                 options = self._settings.seeds
                 seeds = SeedGrid.from_frame(frame, (options.rows, options.columns))
+            acquiring = self._beside.submit(self._acquire, frame, seeds)
             regions = self._beside.submit(self._regions, seeds)
             with self.times.stage("improvement"):
                 improvement = self._improvement.select(seeds)
-            acquisition = self._acquire(frame, seeds)
+            acquisition = acquiring.result()
             model = self._model(frame, acquisition)
             return Step(
                 frame=frame,
@@ -105,7 +110,7 @@ class Loop:
                 seeds,
                 options.budget,
                 rounds=options.rounds,
-                threads=self._settings.run.threads,
+                threads=self._threads,
             )
 
     def _model(self, frame: DepthFrame, acquisition: Acquisition | None) -> Model | None:
@@ -124,7 +129,7 @@ class Loop:
 
     def _made(self, frame: DepthFrame, acquisition: Acquisition) -> Model:
         with self.times.stage("model"):
-            depth_mm = acquisition.reconstruct()
+            depth_mm = acquisition.reconstruct(self._threads)
             error_mm = np.abs(depth_mm - frame.depth_mm.astype(np.float32))
             error_mm[frame.depth_mm == 0] = np.nan
             known = error_mm[frame.depth_mm > 0]
