@@ -33,6 +33,7 @@ from selective_depth.selectors.seeds import SeedGrid
 NODES, EPOCHS = 2800, 50
 COLD_FRAMES = 12
 EXACT_FRAMES = 3
+WARM_UP = 10
 
 Say = Callable[[str], None]
 Durations = dict[str, list[float]]
@@ -168,7 +169,8 @@ def _time_improvement(seeds: list[SeedGrid], durations: Durations, say: Say) -> 
     for name, threads in (("improvement", None), ("improvement_one_thread", 1)):
         say(name.replace("_", " "))
         selector = ImprovementSelector(threads=threads)
-        selector.select(seeds[0])  # compiles and builds the tables
+        for grid in seeds[:WARM_UP]:  # compiles, builds the tables, starts the threads
+            selector.select(grid)
         _timed(durations, name, (partial(selector.select, grid) for grid in seeds))
 
 

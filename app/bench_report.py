@@ -39,6 +39,11 @@ The same work in other libraries, timed in the same run:
 of the first frame from its 16 nearest seeds, estimate and variance only; PyKrige's time is extended
 from two samples of the pixels. `numpy_neural_gas` is a plain NumPy loop of eq. (1)-(4), extended
 from 3,000 steps to 50 epochs.
+
+How exact the timed code is: the map against eq. (13) in float64 in
+[improvement.md](improvement.md), the trainings against a plain float64 loop and against each
+other in [neural-gas.md](neural-gas.md). Times vary from run to run on a shared machine; the
+ratios vary less.
 """
 
 
