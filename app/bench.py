@@ -98,7 +98,7 @@ def machine() -> dict[str, str]:
     return {
         "processor": model,
         "cores": str(os.cpu_count()),
-        "system": f"{platform.system()} {platform.release()}",
+        "system": platform.system(),
         "python": platform.python_version(),
         **{name: version(name) for name in ("numpy", "scipy", "numba", "rerun-sdk")},
     }
