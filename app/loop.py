@@ -8,6 +8,7 @@ from typing import Self
 
 import numpy as np
 
+from selective_depth.app.precompile import compiling_beside
 from selective_depth.app.settings import Settings
 from selective_depth.app.step import Model, Step
 from selective_depth.app.timing import StageTimes
@@ -71,6 +72,9 @@ class Loop:
 
     def warm_up(self, frame: DepthFrame) -> None:
         """Compile the kernels, fill the tables and train the first nodes, untimed."""
+        options = self._settings.seeds
+        with compiling_beside():
+            self._improvement.select(SeedGrid.from_frame(frame, (options.rows, options.columns)))
         self.turn(frame)
         self.times.clear()
 
