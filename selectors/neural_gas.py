@@ -48,8 +48,13 @@ class NeuralGasSelector:
 
     Examples
     --------
-    >>> selector = NeuralGasSelector(nodes=1400)            # doctest: +SKIP
-    >>> selection = selector.select(SeedGrid.from_frame(frame))  # doctest: +SKIP
+    >>> import numpy as np
+    >>> wall_mm = np.full((48, 64), 2000, np.uint16)
+    >>> wall_mm[16:32, 20:44] = 1200  # a box before it
+    >>> seeds = SeedGrid.from_array(wall_mm, (24, 32))
+    >>> selection = NeuralGasSelector(nodes=100).select(seeds)
+    >>> selection.nodes_mm.shape, selection.mask.shape
+    ((100, 3), (48, 64))
 
     References
     ----------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import doctest
+import importlib
 import re
 import shlex
 import subprocess
@@ -58,6 +60,15 @@ def test_python_runs_as_written(code: str, tmp_path: Path) -> None:
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "module", [path.stem for path in (ROOT / "selectors").glob("*.py") if ">>>" in path.read_text()]
+)
+def test_docstring_examples_give_what_they_say(module: str) -> None:
+    found = doctest.testmod(importlib.import_module(f"selective_depth.selectors.{module}"))
+    assert found.attempted > 0
+    assert found.failed == 0
 
 
 def test_commands_and_options_exist(help_of: dict[str, str]) -> None:
