@@ -7,6 +7,7 @@ import shutil
 import socket
 import sys
 import time
+from abc import ABC, abstractmethod
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -41,7 +42,7 @@ INDEXED_FRAMES = 1000
 """Up to so many frames a file gets an index; beyond, its memory would be felt."""
 
 
-class Place:
+class Place(ABC):
     """One place where steps go. All of it runs in one thread of its own.
 
     Parameters
@@ -88,8 +89,9 @@ class Place:
         else:
             self._recording.abandon()
 
+    @abstractmethod
     def _connect(self) -> Recording:
-        raise NotImplementedError
+        """Open the recording that the steps go to."""
 
 
 class FilePlace(Place):

@@ -34,7 +34,7 @@ def print_devices() -> int:
     runtime = find_runtime()
     with waiting("Asking OpenNI2 for its sensors"):
         found = list_devices()
-    say(f"OpenNI2 {runtime_version()}, {runtime.library}")
+    say(f"OpenNI2 {runtime_version()}, {runtime.path}")
     say(f"drivers: {', '.join(runtime.drivers) or 'none'}")
     if not found:
         say(f"no sensor found. {usb_advice(runtime.drivers) or UNKNOWN_ADVICE}")

@@ -92,7 +92,7 @@ class Worker:
         self._reader.start()
         start = {
             "job": job,
-            "library": str(runtime.library),
+            "library": str(runtime.path),
             "memory": name,
             "slots": _SLOTS,
             "slot_bytes": _SLOT_BYTES,

@@ -32,16 +32,16 @@ class Runtime:
 
     Parameters
     ----------
-    library : Path
+    path : Path
         The shared library; its drivers are in ``OpenNI2/Drivers`` beside it.
     """
 
-    library: Path
+    path: Path
 
     @property
     def drivers(self) -> tuple[str, ...]:
         """Names of the sensor drivers it will load, without prefix and suffix."""
-        files = (self.library.parent / "OpenNI2" / "Drivers").glob("*")
+        files = (self.path.parent / "OpenNI2" / "Drivers").glob("*")
         plain = {file.name.partition(".")[0].removeprefix("lib") for file in files}
         return tuple(sorted(plain - {"OniFile", ""}))
 

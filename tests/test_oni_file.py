@@ -132,7 +132,7 @@ def test_the_real_player_delivers_what_is_written_and_what_is_repaired(
     wide = tmp_path / "wide.oni"
     write_oni(wide, _frames(2, Camera.kinect(1280, 1024)))
     paths = [recording, repaired, killed, wide]
-    outcomes = list(play_all(paths, find_runtime().library, patience_s=3.0))
+    outcomes = list(play_all(paths, find_runtime().path, patience_s=3.0))
     for path, outcome, count in zip(paths, outcomes, (COUNT, COUNT - 1, COUNT - 1, 2), strict=True):
         expected = digest_of(
             (frame.index + 1, *frame.shape, frame.depth_mm.tobytes()) for frame in _read(path)
@@ -153,7 +153,7 @@ def test_what_openni2s_recorder_swaps_is_read_rightly_and_can_be_mended_in_place
     depth[1:, -1, -1] = 1001
     path, out = tmp_path / "swapped.oni", tmp_path / "repaired.oni"
     record_oni(depth, path)
-    library = find_runtime().library
+    library = find_runtime().path
     wrong = next(play_all([path], library, patience_s=3.0))
     report = inspect_oni(path, decode=True)
     assert report.complete and report.swapped_frames == 2

@@ -76,7 +76,7 @@ def _fuzz(sound: bytes, folder: Path, *, mutated: int, cut: int, seed: int) -> C
     original.write_bytes(sound)
     expected = _deliver(OniReader(original))[0]
     counts: Counter[str] = Counter()
-    for outcome in play_all(files(), find_runtime().library):
+    for outcome in play_all(files(), find_runtime().path):
         counts.update(_try(names[-1], folder / "damaged.oni", outcome, expected))
     assert len(names) == mutated + cut
     return counts
@@ -102,7 +102,7 @@ def _replay_repaired(
             names.append(name)
             yield repaired
 
-    for outcome in play_all(files(), find_runtime().library, patience_s=3.0):
+    for outcome in play_all(files(), find_runtime().path, patience_s=3.0):
         with OniReader(repaired) as reader:
             frames = [(f.index + 1, *f.shape, f.depth_mm.tobytes()) for f in reader]
         assert (outcome.frames, outcome.digest) == digest_of(frames), f"{names[-1]}: {outcome}"
@@ -126,7 +126,7 @@ def _try(name: str, path: Path, outcome: Outcome, expected: list[DepthFrame]) ->
     if quick and not _fits(outcome, right if exact else None):
         # OpenNI2 may be late, and it has a race of its own at closing; damage shows every time.
         yield "played again"
-        outcome = next(play_all([path], find_runtime().library, patience_s=3.0))
+        outcome = next(play_all([path], find_runtime().path, patience_s=3.0))
         assert _fits(outcome, right if exact else None), f"{name}: openable, but {outcome}"
 
     shown, error = _deliver_timed(name, path, open_source)

@@ -31,7 +31,7 @@ def test_a_chosen_runtime_is_the_one(
         (drivers / driver).touch()
     monkeypatch.setenv(variable, str(tmp_path))
     runtime = find_runtime()
-    assert runtime.library == tmp_path / name
+    assert runtime.path == tmp_path / name
     assert runtime.drivers == ("FreenectDriver", "PS1080")
 
 
