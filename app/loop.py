@@ -43,9 +43,11 @@ class Loop:
 
     def __init__(self, settings: Settings, *, every_model: bool = True) -> None:
         gas, improvement = settings.gas, settings.improvement
-        # Three stages side by side keep two cores busy with a thread each; with more, each
-        # would wait for parts of its work to get through behind parts of the others'.
-        threads = settings.run.threads or (1 if settings.acquire.budget else None)
+        # A sensor's frames come whether two cores are free or not. Three stages side by side
+        # keep both busy with a thread each; with more, each would wait for parts of its work to
+        # get through behind parts of the others'.
+        crowded = settings.acquire.budget > 0 and not every_model
+        threads = settings.run.threads or (1 if crowded else None)
         self._threads = threads
         self.times = StageTimes()
         self._settings = settings
