@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
@@ -14,7 +18,7 @@ from selective_depth.app.step import Model, Step
 from selective_depth.app.timing import StageTimes
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import Acquisition, acquire
-from selective_depth.selectors.improvement import ImprovementSelector
+from selective_depth.selectors.improvement import ImprovementSelection, ImprovementSelector
 from selective_depth.selectors.neural_gas import NeuralGasSelector
 from selective_depth.selectors.regions import RegionSelection
 from selective_depth.selectors.seeds import SeedGrid
@@ -22,6 +26,35 @@ from selective_depth.selectors.seeds import SeedGrid
 MODEL_EVERY = 10
 """Of a sensor's frames, one in so many gets a dense model: at 30 frames/s, one of every frame
 would take most of a core, which the frames themselves need."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Turn:
+    """A frame under way: what is made of it, and what is being made.
+
+    Parameters
+    ----------
+    frame : DepthFrame
+        What the sensor delivered.
+    state : str
+        The sensor's.
+    seeds : SeedGrid
+        The first measurements.
+    regions : RegionSelection
+        What the neural gas selected.
+    improving, acquiring : Future
+        The other two parts, each in a thread beside the loop.
+    begun_ms : float
+        How long the loop was busy with it so far.
+    """
+
+    frame: DepthFrame
+    state: str
+    seeds: SeedGrid
+    regions: RegionSelection
+    improving: Future[ImprovementSelection]
+    acquiring: Future[Acquisition | None]
+    begun_ms: float
 
 
 class Loop:
@@ -43,11 +76,10 @@ class Loop:
 
     def __init__(self, settings: Settings, *, every_model: bool = True) -> None:
         gas, improvement = settings.gas, settings.improvement
-        # A sensor's frames come whether two cores are free or not. Three stages side by side
-        # keep both busy with a thread each; with more, each would wait for parts of its work to
-        # get through behind parts of the others'.
-        crowded = settings.acquire.budget > 0 and not every_model
-        threads = settings.run.threads or (1 if crowded else None)
+        self._overlap = int(settings.acquire.budget > 0 and not every_model)
+        # Stages of two frames side by side keep two cores busy with a thread each; with more,
+        # each would wait for parts of its work to get through behind parts of the others'.
+        threads = settings.run.threads or (1 if self._overlap else None)
         self._threads = threads
         self.times = StageTimes()
         self._settings = settings
@@ -82,29 +114,59 @@ class Loop:
 
     def turn(self, frame: DepthFrame, state: str = "replay") -> Step:
         """Make all of a frame that there is to make."""
-        with self.times.stage("loop"):
-            with self.times.stage("seeds"):
-                options = self._settings.seeds
-                seeds = SeedGrid.from_frame(frame, (options.rows, options.columns))
-            acquiring = self._beside.submit(self._acquire, frame, seeds)
-            regions = self._beside.submit(self._regions, seeds)
-            with self.times.stage("improvement"):
-                improvement = self._improvement.select(seeds)
-            acquisition = acquiring.result()
-            model = self._model(frame, acquisition)
-            return Step(
-                frame=frame,
-                seeds=seeds,
-                regions=regions.result(),
-                improvement=improvement,
-                acquisition=acquisition,
-                model=model,
-                state=state,
-            )
+        return self._end(self._begin(frame, state))
+
+    def steps(self, frames: Iterable[tuple[DepthFrame, str] | None]) -> Iterator[Step]:
+        """Turn all of these frames, each with its sensor's state; None where none came in time.
+
+        Where a sensor's frames are acquired, the next one is begun before the last is ended: it
+        comes sooner than a processor can acquire, and so all of them are kept busy.
+        """
+        under_way: deque[_Turn] = deque()
+        for each in frames:
+            if each is not None:
+                under_way.append(self._begin(*each))
+            while len(under_way) > (0 if each is None else self._overlap):
+                yield self._end(under_way.popleft())
+        while under_way:
+            yield self._end(under_way.popleft())
+
+    def _begin(self, frame: DepthFrame, state: str) -> _Turn:
+        """Take a frame's seeds, set the rest going, and train the nodes meanwhile."""
+        start_s = time.perf_counter()
+        with self.times.stage("seeds"):
+            options = self._settings.seeds
+            seeds = SeedGrid.from_frame(frame, (options.rows, options.columns))
+        acquiring = self._beside.submit(self._acquire, frame, seeds)
+        improving = self._beside.submit(self._improve, seeds)
+        # In this thread, for the training of a frame begins where the last one's ended.
+        regions = self._regions(seeds)
+        begun_ms = (time.perf_counter() - start_s) * 1000
+        return _Turn(frame, state, seeds, regions, improving, acquiring, begun_ms)
+
+    def _end(self, turn: _Turn) -> Step:
+        """Wait until all of a frame is made; stage "loop" is the time in `_begin` and here."""
+        start_s = time.perf_counter()
+        improvement, acquisition = turn.improving.result(), turn.acquiring.result()
+        model = self._model(turn.frame, acquisition)
+        self.times.add("loop", turn.begun_ms + (time.perf_counter() - start_s) * 1000)
+        return Step(
+            frame=turn.frame,
+            seeds=turn.seeds,
+            regions=turn.regions,
+            improvement=improvement,
+            acquisition=acquisition,
+            model=model,
+            state=turn.state,
+        )
 
     def _regions(self, seeds: SeedGrid) -> RegionSelection:
         with self.times.stage("neural_gas"):
             return self._gas.update(seeds) if self._live_gas else self._gas.select(seeds)
+
+    def _improve(self, seeds: SeedGrid) -> ImprovementSelection:
+        with self.times.stage("improvement"):
+            return self._improvement.select(seeds)
 
     def _acquire(self, frame: DepthFrame, seeds: SeedGrid) -> Acquisition | None:
         options = self._settings.acquire

@@ -46,12 +46,17 @@ class RunReport:
         What was run.
     live : bool
         Whether frames could be lost.
+    dropped_starting : int
+        Frames lost while everything was got ready with the first one.
+    dropped : int
+        Frames lost since then.
     """
 
     source: str
     live: bool
     frames: int = 0
     seconds: float = 0.0
+    dropped_starting: int = 0
     dropped: int = 0
     missed: dict[str, int] = field(default_factory=dict)
     stages: dict[str, StageSummary] = field(default_factory=dict)
@@ -100,6 +105,7 @@ def print_report(report: RunReport) -> None:
     table.add_row("frames", f"{report.frames:,}", "")
     table.add_row("whole loop", f"{report.fps:.1f}", "frames/s")
     if report.live:
+        table.add_row("skipped while starting", f"{report.dropped_starting:,}", "frames")
         table.add_row("skipped to keep up", f"{report.dropped:,}", "frames")
         table.add_row("sensor at the end", report.state, "")
     for name, missed in report.missed.items():

@@ -118,6 +118,7 @@ class Session:
         self.report = RunReport(uri, live=False)
         self._uri = uri
         self.last: Step | None = None
+        self._ready_s = 0.0
 
     def run(self) -> int:
         """Run to the end of the source, the asked number of frames, or Ctrl-C.
@@ -156,41 +157,34 @@ class Session:
             finally:
                 report.troubles += viewer.close()
                 report.missed = viewer.dropped
-                report.dropped = source.dropped
+                report.dropped = source.dropped - report.dropped_starting
                 report.stages = loop.times.summary()
             if seen.save is not None and self.last is not None:
                 self._write_beside(seen.save, picture=not viewer.window)
         return code
 
     def _turn_all(self, source: DepthSource, loop: Loop, viewer: Viewer) -> None:
-        limit = self.settings.run.frames
-        total = _frames_in_all(limit, source.frame_count)
-        start_s = time.monotonic()
-        recent = deque([start_s], maxlen=31)
+        total = _frames_in_all(self.settings.run.frames, source.frame_count)
+        recent: deque[float] = deque(maxlen=31)
         with FrameProgress(self._uri, total) as progress:
-            for frame in self._frames(source, loop, viewer, progress):
-                if self.report.frames == 0:
-                    began_s = time.monotonic()
-                    with waiting("Compiling for this machine; the next run starts at once"):
-                        loop.warm_up(frame)
-                        viewer.wait_ready()
-                    start_s = recent[0] = time.monotonic()
-                    log.info("ready after %.1f s", start_s - began_s)
-                step = loop.turn(frame, _state(source))
+            for step in loop.steps(self._frames(source, loop, viewer, progress)):
+                if not recent:
+                    recent.append(self._ready_s)
                 recent.append(time.monotonic())
                 fps = (len(recent) - 1) / (recent[-1] - recent[0])
                 self._show(step, fps, source, loop, viewer)
-                self.report.seconds = time.monotonic() - start_s
+                self.report.seconds = time.monotonic() - self._ready_s
                 progress.update(self.report.frames, f"{fps:.0f} frames/s")
-                if self.report.frames == limit:
-                    return
 
     def _frames(
         self, source: DepthSource, loop: Loop, viewer: Viewer, progress: FrameProgress
-    ) -> Iterator[DepthFrame]:
-        """All frames; a live source that has none shows its state meanwhile."""
-        state = _state(source)
-        while True:
+    ) -> Iterator[tuple[DepthFrame, str] | None]:
+        """As many frames as asked for, each with the sensor's state; None when a sensor is silent.
+
+        The first is handed on when everything is ready.
+        """
+        state, taken = _state(source), 0
+        while taken != self.settings.run.frames:
             interrupt.check()
             frame = None
             try:
@@ -206,8 +200,23 @@ class Session:
                 state = _state(source)
                 reason = getattr(source, "state_reason", "")
                 progress.say(f"sensor {state}{': ' if reason else ''}{reason}")
-            if frame is not None:
-                yield frame
+            if frame is None:
+                yield None
+                continue
+            if taken == 0:
+                self._get_ready(frame, loop, viewer)
+            elif taken == 1:
+                self.report.dropped_starting = source.dropped
+            taken += 1
+            yield frame, state
+
+    def _get_ready(self, frame: DepthFrame, loop: Loop, viewer: Viewer) -> None:
+        began_s = time.monotonic()
+        with waiting("Compiling for this machine; the next run starts at once"):
+            loop.warm_up(frame)
+            viewer.wait_ready()
+        self._ready_s = time.monotonic()
+        log.info("ready after %.1f s", self._ready_s - began_s)
 
     def _show(
         self, step: Step, fps: float, source: DepthSource, loop: Loop, viewer: Viewer

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -114,12 +115,57 @@ def test_live_goes_on_through_stall_and_loss(monkeypatch: pytest.MonkeyPatch) ->
     assert session.report.live
 
 
+def test_what_is_lost_while_starting_is_counted_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Script([0, 8, 9, 12], live=True)
+
+    def read(
+        timeout_s: float = 5.0, plain: Callable[[float], DepthFrame] = source.read
+    ) -> DepthFrame:
+        frame = plain(timeout_s)
+        source.dropped = {0: 0, 8: 7, 9: 7, 12: 9}[frame.index]
+        return frame
+
+    monkeypatch.setattr(source, "read", read)
+    _, session = run(monkeypatch, source)
+    assert (session.report.dropped_starting, session.report.dropped) == (7, 2)
+
+
 def test_a_live_loop_makes_the_model_of_some_frames_only() -> None:
     settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, rounds=2))
     with Loop(settings, every_model=False) as loop:
         for index in range(3 * MODEL_EVERY):
             loop.turn(make_frame(index))
     assert 1 <= loop.times.summary()["model"].count <= 3
+
+
+@pytest.mark.parametrize(("budget", "every_model"), [(0.05, False), (0.05, True), (0.0, False)])
+def test_steps_come_in_order_and_none_is_held_back_from_silence(
+    budget: float, every_model: bool
+) -> None:
+    """A sensor's acquired frames overlap; the steps are those of one frame at a time."""
+    settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=budget, rounds=2))
+    ahead: list[int] = []
+    taken = 0
+
+    def frames() -> Iterator[tuple[DepthFrame, str] | None]:
+        for index in range(6):
+            yield make_frame(index), f"state {index}"
+            ahead.append(index + 1 - taken)
+        yield None
+        assert taken == 6, "a step waits for a frame that does not come"
+        yield make_frame(6), "state 6"
+
+    with Loop(settings, every_model=every_model) as loop, Loop(settings) as plain:
+        for index, step in enumerate(loop.steps(frames())):
+            taken += 1
+            expected = plain.turn(make_frame(index))
+            assert (step.frame.index, step.state) == (index, f"state {index}")
+            np.testing.assert_array_equal(step.regions.mask, expected.regions.mask)
+            np.testing.assert_array_equal(step.improvement.score, expected.improvement.score)
+            if step.acquisition is not None and expected.acquisition is not None:
+                np.testing.assert_array_equal(step.acquisition.uv, expected.acquisition.uv)
+    assert taken == 7
+    assert max(ahead) == (1 if budget and not every_model else 0)
 
 
 def test_damaged_recording_ends_with_what_was_read(monkeypatch: pytest.MonkeyPatch) -> None:
