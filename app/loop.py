@@ -42,8 +42,8 @@ class _Turn:
         The first measurements.
     regions : RegionSelection
         What the neural gas selected.
-    improving, acquiring : Future
-        The other two parts, each in a thread beside the loop.
+    improving, modelling : Future
+        The other parts, in threads beside the loop.
     begun_ms : float
         How long the loop was busy with it so far.
     """
@@ -53,7 +53,7 @@ class _Turn:
     seeds: SeedGrid
     regions: RegionSelection
     improving: Future[ImprovementSelection]
-    acquiring: Future[Acquisition | None]
+    modelling: Future[tuple[Acquisition | None, Model | None]]
     begun_ms: float
 
 
@@ -64,9 +64,9 @@ class Loop:
     ----------
     settings : Settings
         Options of the seeds, the selectors and the acquisition.
-    every_model : bool, default True
-        Make the dense model of every frame. Otherwise that of every `MODEL_EVERY`-th is made
-        beside the loop, and the other frames have none: a sensor does not wait.
+    realtime : bool, default False
+        Frames come whether the loop is ready or not. Then the dense model of every
+        `MODEL_EVERY`-th is made beside it, and the other frames have none.
 
     Raises
     ------
@@ -74,11 +74,9 @@ class Loop:
         If an option of a selector is out of its range.
     """
 
-    def __init__(self, settings: Settings, *, every_model: bool = True) -> None:
+    def __init__(self, settings: Settings, *, realtime: bool = False) -> None:
         gas, improvement = settings.gas, settings.improvement
-        self._overlap = int(settings.acquire.budget > 0 and not every_model)
-        # Stages of two frames side by side keep two cores busy with a thread each; with more,
-        # each would wait for parts of its work to get through behind parts of the others'.
+        self._overlap = int(settings.acquire.budget > 0 or not realtime)
         threads = settings.run.threads or (1 if self._overlap else None)
         self._threads = threads
         self.times = StageTimes()
@@ -96,7 +94,7 @@ class Loop:
         self._improvement = ImprovementSelector(
             share=improvement.share, exponent=improvement.exponent, threads=threads
         )
-        self._every_model = every_model
+        self._realtime = realtime
         # The stages are compiled and free of the GIL: side by side they take as long as the
         # longest of them.
         self._beside = ThreadPoolExecutor(2, thread_name_prefix="beside")
@@ -119,8 +117,10 @@ class Loop:
     def steps(self, frames: Iterable[tuple[DepthFrame, str] | None]) -> Iterator[Step]:
         """Turn all of these frames, each with its sensor's state; None where none came in time.
 
-        Where a sensor's frames are acquired, the next one is begun before the last is ended: it
-        comes sooner than a processor can acquire, and so all of them are kept busy.
+        While one is made, the next is begun: two frames with a thread for each of their parts keep
+        two processors busier than one frame whose every part waits for its slowest thread. Only a
+        sensor's frames of which nothing is acquired are made one by one: they are ready long
+        before the next one comes, and so are seen at once.
         """
         under_way: deque[_Turn] = deque()
         for each in frames:
@@ -137,18 +137,20 @@ class Loop:
         with self.times.stage("seeds"):
             options = self._settings.seeds
             seeds = SeedGrid.from_frame(frame, (options.rows, options.columns))
-        acquiring = self._beside.submit(self._acquire, frame, seeds)
+        modelling = self._beside.submit(self._acquire_and_model, frame, seeds)
         improving = self._beside.submit(self._improve, seeds)
         # In this thread, for the training of a frame begins where the last one's ended.
         regions = self._regions(seeds)
         begun_ms = (time.perf_counter() - start_s) * 1000
-        return _Turn(frame, state, seeds, regions, improving, acquiring, begun_ms)
+        return _Turn(frame, state, seeds, regions, improving, modelling, begun_ms)
 
     def _end(self, turn: _Turn) -> Step:
         """Wait until all of a frame is made; stage "loop" is the time in `_begin` and here."""
         start_s = time.perf_counter()
-        improvement, acquisition = turn.improving.result(), turn.acquiring.result()
-        model = self._model(turn.frame, acquisition)
+        improvement = turn.improving.result()
+        acquisition, model = turn.modelling.result()
+        if acquisition is not None and model is None:
+            model = self._model_of_some(turn.frame, acquisition)
         self.times.add("loop", turn.begun_ms + (time.perf_counter() - start_s) * 1000)
         return Step(
             frame=turn.frame,
@@ -168,34 +170,34 @@ class Loop:
         with self.times.stage("improvement"):
             return self._improvement.select(seeds)
 
-    def _acquire(self, frame: DepthFrame, seeds: SeedGrid) -> Acquisition | None:
+    def _acquire_and_model(
+        self, frame: DepthFrame, seeds: SeedGrid
+    ) -> tuple[Acquisition | None, Model | None]:
         options = self._settings.acquire
         if options.budget == 0:
-            return None
+            return None, None
         with self.times.stage("acquire"):
-            return acquire(
+            acquisition = acquire(
                 frame.measure,
                 seeds,
                 options.budget,
                 rounds=options.rounds,
                 threads=self._threads,
             )
+        return acquisition, self._model(frame, acquisition) if not self._realtime else None
 
-    def _model(self, frame: DepthFrame, acquisition: Acquisition | None) -> Model | None:
-        if acquisition is None:
-            return None
-        if self._every_model:
-            return self._made(frame, acquisition)
+    def _model_of_some(self, frame: DepthFrame, acquisition: Acquisition) -> Model | None:
+        """Begin a model now and then, and return it when it is made."""
         self._since_model += 1
         done = self._pending if self._pending and self._pending.done() else None
         if done:
             self._pending = None
         if self._pending is None and self._since_model >= MODEL_EVERY:
-            self._pending = self._modelling.submit(self._made, frame, acquisition)
+            self._pending = self._modelling.submit(self._model, frame, acquisition)
             self._since_model = 0
         return done.result() if done else None
 
-    def _made(self, frame: DepthFrame, acquisition: Acquisition) -> Model:
+    def _model(self, frame: DepthFrame, acquisition: Acquisition) -> Model:
         with self.times.stage("model"):
             depth_mm = acquisition.reconstruct(self._threads)
             error_mm = np.abs(depth_mm - frame.depth_mm.astype(np.float32))

@@ -118,6 +118,7 @@ class Session:
         self.report = RunReport(uri, live=False)
         self._uri = uri
         self.last: Step | None = None
+        self._code = OK
         self._ready_s = 0.0
 
     def run(self) -> int:
@@ -129,7 +130,6 @@ class Session:
             Exit code, as for `watch`.
         """
         report = self.report
-        code = OK
         with ExitStack() as stack:
             with waiting(f"Opening {self._uri}"):
                 source = stack.enter_context(open_source(self._uri))
@@ -139,7 +139,7 @@ class Session:
             _tell(source)
             seen = _with_a_place(self.settings.viewer, self._uri)
             self.settings = dataclasses.replace(self.settings, viewer=seen)
-            loop = stack.enter_context(Loop(self.settings, every_model=not source.live))
+            loop = stack.enter_context(Loop(self.settings, realtime=source.live))
             frames = _frames_in_all(self.settings.run.frames, source.frame_count)
             viewer = Viewer(seen, live=source.live, times=loop.times, frames=frames)
             if seen.serve:
@@ -150,10 +150,7 @@ class Session:
                     say("All frames are served; Ctrl-C ends.")
                     threading.Event().wait()
             except KeyboardInterrupt:
-                code = INTERRUPTED
-            except DamagedRecordingError as error:
-                report.troubles.append(str(error))
-                code = FAILED
+                self._code = INTERRUPTED
             finally:
                 report.troubles += viewer.close()
                 report.missed = viewer.dropped
@@ -161,7 +158,7 @@ class Session:
                 report.stages = loop.times.summary()
             if seen.save is not None and self.last is not None:
                 self._write_beside(seen.save, picture=not viewer.window)
-        return code
+        return self._code
 
     def _turn_all(self, source: DepthSource, loop: Loop, viewer: Viewer) -> None:
         total = _frames_in_all(self.settings.run.frames, source.frame_count)
@@ -191,6 +188,10 @@ class Session:
                 with loop.times.stage("read"):
                     frame = source.read(POLL_S) if source.live else source.read()
             except SourceEndedError:
+                return
+            except DamagedRecordingError as error:
+                self.report.troubles.append(str(error))
+                self._code = FAILED
                 return
             except (SourceTimeoutError, DeviceLostError):
                 if not source.live:

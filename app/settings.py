@@ -75,7 +75,7 @@ class RunOptions:
     frames: Annotated[int | None, optional("N")] = None
     """Stop after this many frames; by default at the end of the recording, or with Ctrl-C."""
     threads: Annotated[int | None, optional("N")] = None
-    """Threads of each stage; by default one per processor, or one with --budget in real time."""
+    """Threads of each stage; by default one, or one per processor where frames do not overlap."""
     realtime: Flag = False
     """Replay at the recorded rate, the newest frame first, as a sensor would deliver."""
 

@@ -132,17 +132,17 @@ def test_what_is_lost_while_starting_is_counted_apart(monkeypatch: pytest.Monkey
 
 def test_a_live_loop_makes_the_model_of_some_frames_only() -> None:
     settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, rounds=2))
-    with Loop(settings, every_model=False) as loop:
+    with Loop(settings, realtime=True) as loop:
         for index in range(3 * MODEL_EVERY):
             loop.turn(make_frame(index))
     assert 1 <= loop.times.summary()["model"].count <= 3
 
 
-@pytest.mark.parametrize(("budget", "every_model"), [(0.05, False), (0.05, True), (0.0, False)])
+@pytest.mark.parametrize(("budget", "realtime"), [(0.05, False), (0.05, True), (0.0, True)])
 def test_steps_come_in_order_and_none_is_held_back_from_silence(
-    budget: float, every_model: bool
+    budget: float, realtime: bool
 ) -> None:
-    """A sensor's acquired frames overlap; the steps are those of one frame at a time."""
+    """Frames overlap; the steps are those of one frame at a time."""
     settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=budget, rounds=2))
     ahead: list[int] = []
     taken = 0
@@ -155,7 +155,7 @@ def test_steps_come_in_order_and_none_is_held_back_from_silence(
         assert taken == 6, "a step waits for a frame that does not come"
         yield make_frame(6), "state 6"
 
-    with Loop(settings, every_model=every_model) as loop, Loop(settings) as plain:
+    with Loop(settings, realtime=realtime) as loop, Loop(settings) as plain:
         for index, step in enumerate(loop.steps(frames())):
             taken += 1
             expected = plain.turn(make_frame(index))
@@ -165,7 +165,7 @@ def test_steps_come_in_order_and_none_is_held_back_from_silence(
             if step.acquisition is not None and expected.acquisition is not None:
                 np.testing.assert_array_equal(step.acquisition.uv, expected.acquisition.uv)
     assert taken == 7
-    assert max(ahead) == (1 if budget and not every_model else 0)
+    assert max(ahead) == (1 if budget or not realtime else 0)
 
 
 def test_damaged_recording_ends_with_what_was_read(monkeypatch: pytest.MonkeyPatch) -> None:
