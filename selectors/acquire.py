@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.selectors.reconstruct import reconstruct
+from selective_depth.selectors.refine import finer_lattice
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.scores import Score, StepScore
 from selective_depth.selectors.seeds import SeedGrid
@@ -96,6 +97,13 @@ def shots_of(budget: float, shape: tuple[int, int]) -> int:
     return round(float(shots))
 
 
+def _shares(shots: int, rounds: int, first: int) -> list[int]:
+    """Shots made at the end of each round: all rounds alike, or all after a first that is given."""
+    given = [first] if first else []
+    count = rounds - len(given)
+    return given + [first + (shots - first) * (n + 1) // count for n in range(count)]
+
+
 def acquire(
     measure: Measure,
     seeds: SeedGrid,
@@ -119,7 +127,8 @@ def acquire(
         Float: share of the frame's pixels. Int: number of measurements. A measurement that
         returns nothing is paid for as well.
     rounds : int, default 8
-        In how many rounds; 1 decides everything from the seeds.
+        In how many rounds; 1 decides everything from the seeds. Where these are few and far
+        apart, the first of several rounds makes their lattice finer (`finer_lattice`).
     selector : Score, optional
         What a shot is worth; default `StepScore`.
     threads : int, optional
@@ -135,15 +144,16 @@ def acquire(
         raise ValueError(f"{rounds} rounds were asked for; give between 1 and {MOST_ROUNDS}")
     score = StepScore() if selector is None else selector
     shots = shots_of(budget, seeds.frame_shape)
-    samples = Samples.of(seeds)
+    even_uv, pitch_px = finer_lattice(seeds, shots if rounds > 1 else 0)
+    samples = Samples.of(seeds, pitch_px)
     plan = score.plan(samples, threads)
     lattice_uv = seeds.lattice_uv.reshape(-1, 2)
     lattice_mm = seeds.depth_mm.ravel()
     uv, depth, whole = [lattice_uv], [lattice_mm], True
     made: list[Round] = []
-    for number in range(rounds):
-        due = shots * (number + 1) // rounds - sum(r.shots for r in made)
-        new_uv = plan.best(due)
+    for due in _shares(shots, rounds, len(even_uv)):
+        spent = sum(r.shots for r in made)
+        new_uv = even_uv if len(even_uv) and not made else plan.best(due - spent)
         answer = np.asarray(measure(new_uv))
         new_mm = answer.astype(np.float32)
         new_mm[~(np.isfinite(new_mm) & (new_mm > 0))] = 0

@@ -13,6 +13,10 @@ from selective_depth.selectors.seeds import SeedGrid
 MISSED = np.float32(-1)
 """In an image of samples: measured, but nothing returned."""
 
+REACH = 1.3
+"""Farther than so many steps of the lattice from every sample that returned depth, a shot would
+mostly hit a hole: 6.5 pixels for 128x128 seeds on 640x480."""
+
 _WORD = 64
 
 
@@ -89,7 +93,7 @@ class Samples:
         self.shape = shape
         self.pitch_px = pitch_px
         self.vote_px = min(math.ceil(1.8 * pitch_px), (_WORD - 1) // 3)
-        self.reach_px = min(1.3 * pitch_px, self.vote_px)
+        self.reach_px = min(REACH * pitch_px, self.vote_px)
         self.tile_px = 3 * math.ceil(self.vote_px / 3)
         tiles = -(-height // self.tile_px), -(-width // self.tile_px)
         self.image_mm = np.zeros(shape, np.float32)
@@ -99,9 +103,9 @@ class Samples:
         self.stale = np.ones(tiles, np.bool_)
 
     @classmethod
-    def of(cls, seeds: SeedGrid) -> Samples:
-        """The seeds of a frame as its first samples."""
-        samples = cls(seeds.frame_shape, seed_pitch_px(seeds))
+    def of(cls, seeds: SeedGrid, pitch_px: float | None = None) -> Samples:
+        """The seeds of a frame as its first samples; the scale is their own step by default."""
+        samples = cls(seeds.frame_shape, pitch_px or seed_pitch_px(seeds))
         samples.add(seeds.lattice_uv.reshape(-1, 2), seeds.depth_mm.ravel())
         return samples
 

@@ -331,10 +331,12 @@ class StepScore(Score):
 
     Parameters
     ----------
-    voters : int, default 6
+    voters : int, default 5
         How many samples vote, 1 to 6. 4 see a step too late; 8, tried before, blurred it.
-    falloff : float, default 3
-        How fast a vote fades with distance.
+    falloff : float, default 4
+        How fast a vote fades with distance. 3 is better in one shot and 5 in a closed loop: the
+        slower it fades, the wider the band about a strong step that is shot all over before a
+        weaker one is looked at.
     gap : float, default 0.8
         Distance, in steps of the seed lattice, beyond which being farther from the samples
         counts no more (4 pixels for 128x128 seeds on 640x480).
@@ -343,8 +345,8 @@ class StepScore(Score):
         the widest gaps.
     """
 
-    voters: int = 6
-    falloff: float = 3.0
+    voters: int = 5
+    falloff: float = 4.0
     gap: float = 0.8
     noise_mm: float = 1.0
     name = "step score"

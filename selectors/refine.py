@@ -1,0 +1,84 @@
+"""An even, finer lattice before anything else, where the seeds are few beside the budget.
+
+Between seeds far apart stands what none of them hints at: a chair's leg, a gap. No score of the
+seeds finds it, but every other sample in the middle of four does, for a small part of a budget.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from selective_depth.selectors.samples import REACH, seed_pitch_px
+from selective_depth.selectors.seeds import SeedGrid
+
+COARSE_PX = 6.0
+"""Only a lattice with wider steps is refined.
+
+128x128 seeds on 640x480 stand 5 pixels apart, and refining them lowered the oracle share on the
+tuning frames by 1 %, even where it took but a quarter of the budget; 64x64 seeds, 10 pixels apart,
+gained 1 %."""
+
+SHARE = 1 / 3
+"""Most of the budget that it may take: at .33 it still gained, at .42 it lost 1 %."""
+
+
+def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[npt.NDArray[np.int32], float]:
+    """Pixels between the seeds that make their lattice finer, if it is coarse and they are few.
+
+    Each step adds the middles of the squares of neighbours, which shortens the pitch by sqrt(2):
+    first the middles of the cells, then those of their sides.
+
+    Parameters
+    ----------
+    seeds : SeedGrid
+        The first measurements.
+    shots : int
+        The whole budget.
+
+    Returns
+    -------
+    uv : int32 array of shape (n, 2)
+        Pixels to measure, column first, none of them a seed and none beyond reach of a seed that
+        returned depth; often empty.
+    pitch_px : float
+        Widest step of the lattice with them.
+    """
+    rows, columns = seeds.rows.astype(np.int64), seeds.columns.astype(np.int64)
+    pitch_px = seed_pitch_px(seeds)
+    reach_px = REACH * pitch_px
+    added: list[npt.NDArray[np.int64]] = []
+    spent = 0
+    sides = False
+    while pitch_px > COARSE_PX and min(len(rows), len(columns)) > 1:
+        row_middles = _middles(rows, seeds.frame_shape[0])
+        column_middles = _middles(columns, seeds.frame_shape[1])
+        if sides:
+            new = np.concatenate((_grid(rows, column_middles), _grid(row_middles, columns)))
+            rows = np.union1d(rows, row_middles)
+            columns = np.union1d(columns, column_middles)
+        else:
+            new = _grid(row_middles, column_middles)
+        if spent + len(new) > SHARE * shots:
+            break
+        spent += len(new)
+        added.append(new)
+        pitch_px /= 2**0.5
+        sides = not sides
+    if not added or not len(seeds.uv):
+        return np.empty((0, 2), np.int32), seed_pitch_px(seeds)
+    uv = np.concatenate(added)
+    distance_px, _ = cKDTree(seeds.uv).query(uv)
+    return uv[distance_px <= reach_px].astype(np.int32), pitch_px
+
+
+def _middles(at: npt.NDArray[np.int64], pixels: int) -> npt.NDArray[np.int64]:
+    """Between each place and the next; after the last one as well, if there are pixels."""
+    middles = (at[:-1] + at[1:]) // 2
+    last = min(at[-1] + (at[-1] - at[-2]) // 2, pixels - 1)
+    return np.append(middles, last) if last > at[-1] else middles
+
+
+def _grid(rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
