@@ -74,8 +74,9 @@ def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[npt.NDArray[np.int32], f
 
 
 def _middles(at: npt.NDArray[np.int64], pixels: int) -> npt.NDArray[np.int64]:
-    """Between each place and the next; after the last one as well, if there are pixels."""
+    """Between each place and the next; after the last one as well; where there are pixels."""
     middles = (at[:-1] + at[1:]) // 2
+    middles = middles[middles > at[:-1]]
     last = min(at[-1] + (at[-1] - at[-2]) // 2, pixels - 1)
     return np.append(middles, last) if last > at[-1] else middles
 
