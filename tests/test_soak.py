@@ -123,7 +123,8 @@ def check(count: int, uri: str, folder: Path) -> None:
     )
     print(
         f"\n{count} frames, {megabytes[settled]:.0f} to {megabytes[-1]:.0f} MB, {whole:+.2f} MB per"
-        f" 1,000 frames, {late:+.2f} in the second half; {first:.2f} then {last:.2f} frames/s, {watched.skipped} skipped"
+        f" 1,000 frames, {late:+.2f} in the second half; {first:.2f} then {last:.2f} frames/s,"
+        f" {watched.skipped} skipped"
     )
     assert watched.files[-1] <= watched.files[settled], "files are left open"
     assert watched.threads[-1] <= watched.threads[settled], "threads are left running"
