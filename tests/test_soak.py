@@ -111,26 +111,20 @@ def check(count: int, uri: str, folder: Path) -> None:
         watched = fresh.submit(soak, uri, count, folder).result()
     settled = count // 20
     megabytes, times_s = watched.megabytes, watched.times_s
-    # The SDK's allocator takes some 5,000 frames to settle, with nothing but logging too: a leak
-    # is what goes on after that.
-    whole, late = (
-        np.polyfit(np.arange(start, len(megabytes)), megabytes[start:], 1)[0] * 1000
-        for start in (settled, len(megabytes) // 2)
-    )
+    slope = np.polyfit(np.arange(settled, len(megabytes)), megabytes[settled:], 1)[0] * 1000
     span = count // 10
     first, last = (
         span / (times_s[a + span - 1] - times_s[a - 1]) for a in (settled, len(times_s) - span)
     )
     print(
-        f"\n{count} frames, {megabytes[settled]:.0f} to {megabytes[-1]:.0f} MB, {whole:+.2f} MB per"
-        f" 1,000 frames, {late:+.2f} in the second half; {first:.2f} then {last:.2f} frames/s,"
-        f" {watched.skipped} skipped"
+        f"\n{count} frames, {megabytes[settled]:.0f} to {megabytes[-1]:.0f} MB, {slope:+.2f} MB per"
+        f" 1,000 frames; {first:.2f} then {last:.2f} frames/s, {watched.skipped} skipped"
     )
     assert watched.files[-1] <= watched.files[settled], "files are left open"
     assert watched.threads[-1] <= watched.threads[settled], "threads are left running"
     assert max(megabytes) < 600
     if count >= 5000:  # too short a run says nothing of these
-        assert late < 1.0, "memory grows"
+        assert slope < 1.0, "memory grows"
         assert abs(last / first - 1) < 0.03, "its speed changes"
 
 
