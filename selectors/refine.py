@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from selective_depth.selectors.samples import REACH, seed_pitch_px
+from selective_depth.selectors.samples import seed_pitch_px
 from selective_depth.selectors.seeds import SeedGrid
 
 COARSE_PX = 6.0
@@ -22,6 +22,15 @@ gained 1 %."""
 
 SHARE = 1 / 3
 """Most of the budget that it may take: at .33 it still gained, at .42 it lost 1 %."""
+
+
+HOLE_STEPS = 3.0
+"""Farther than so many steps from every seed that returned depth, the inside of a hole begins, and
+the lattice ends. Nearer, things can stand that no seed met, and no score goes there (`REACH`).
+
+Not from the tuning frames, which are indifferent (64x64 seeds, +5 %: oracle share 95.7 % at 1.3
+steps, 95.6 % at 2 and 3, 95.1 % without an end), but from a frame of `sequence`, where the lattice
+missed a thing of 32x5 pixels at 1.3 steps."""
 
 
 def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[npt.NDArray[np.int32], float]:
@@ -40,14 +49,14 @@ def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[npt.NDArray[np.int32], f
     Returns
     -------
     uv : int32 array of shape (n, 2)
-        Pixels to measure, column first, none of them a seed and none beyond reach of a seed that
-        returned depth; often empty.
+        Pixels to measure, column first, none of them a seed and none more than `HOLE_STEPS` from
+        all seeds that returned depth; often empty.
     pitch_px : float
         Widest step of the lattice with them.
     """
     rows, columns = seeds.rows.astype(np.int64), seeds.columns.astype(np.int64)
     pitch_px = seed_pitch_px(seeds)
-    reach_px = REACH * pitch_px
+    reach_px = HOLE_STEPS * pitch_px
     added: list[npt.NDArray[np.int64]] = []
     spent = 0
     sides = False

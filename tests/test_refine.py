@@ -8,8 +8,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from selective_depth.selectors.acquire import acquire
-from selective_depth.selectors.refine import COARSE_PX, SHARE, finer_lattice
-from selective_depth.selectors.samples import REACH, seed_pitch_px
+from selective_depth.selectors.refine import COARSE_PX, HOLE_STEPS, SHARE, finer_lattice
+from selective_depth.selectors.samples import seed_pitch_px
 from selective_depth.selectors.seeds import SeedGrid
 
 
@@ -25,7 +25,7 @@ def flat(lattice: tuple[int, int], shape: tuple[int, int] = (120, 160)) -> SeedG
     seed=st.integers(0, 99),
 )
 @settings(deadline=None)
-def test_new_pixels_are_no_seeds_within_reach_and_within_the_budget(
+def test_new_pixels_are_no_seeds_not_deep_in_holes_and_within_the_budget(
     rows: int, columns: int, shots: int, seed: int
 ) -> None:
     holes = np.random.default_rng(seed).random((120, 160)) < seed / 100
@@ -41,7 +41,7 @@ def test_new_pixels_are_no_seeds_within_reach_and_within_the_budget(
         assert uv[:, 0].max() < 160
         assert uv[:, 1].max() < 120
         apart = np.hypot(*(uv[:, None] - seeds.uv[None]).transpose(2, 0, 1)).min(axis=1)
-        assert apart.max() <= REACH * seed_pitch_px(seeds)
+        assert apart.max() <= HOLE_STEPS * seed_pitch_px(seeds)
 
 
 @pytest.mark.parametrize(("shots", "steps"), [(100, 0), (600, 1), (2000, 2)])
@@ -68,6 +68,16 @@ def test_a_bar_between_coarse_seeds_is_found() -> None:
     assert sum(r.shots for r in model.rounds) == 1500
     wrong = np.abs(model.reconstruct() - depth) > 50
     assert wrong.mean() < 0.002
+
+
+def test_a_thing_in_a_hole_that_no_seed_met_is_found() -> None:
+    depth = np.full((120, 160), 2000, np.uint16)
+    depth[30:90, 60:100] = 0
+    depth[56:64, 76:84] = 800  # seeds are at 55 and 65, 75 and 85
+    seeds = SeedGrid.from_array(depth, (12, 16))
+    assert not (seeds.depth_mm == 800).any()
+    model = acquire(lambda uv: depth[uv[:, 1], uv[:, 0]], seeds, 1500, rounds=4)
+    assert np.abs(model.reconstruct()[56:64, 76:84] - 800).max() < 1
 
 
 def test_one_round_and_fine_seeds_spend_everything_on_the_score() -> None:
