@@ -439,21 +439,22 @@ def bench(
         f"{PROGRAM} evaluate frames/ --budget 0.05 0.10 --json out.json --picture out.png",
         "with a file of all figures and a picture",
     ),
+    (f"{PROGRAM} evaluate frames/ --seeds.rows 64 --seeds.columns 64", "a coarser seed lattice"),
     (f"{PROGRAM} evaluate 'virtual:workstation?noise=off'", "where the truth is exact"),
 )
 def evaluate(
-    sources: Annotated[tuple[str, ...], arg(metavar="SOURCE...")],
+    sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
     every: Annotated[int, arg(metavar="N")] = 20,
-    frames: Annotated[int | None, arg(metavar="N")] = None,
+    frames: Annotated[int | None, optional("N")] = None,
     budget: Annotated[tuple[float, ...], arg(metavar="SHARE...")] = (0.05, 0.10),
     rounds: Annotated[int, arg(metavar="N")] = 8,
     seeds: SeedOptions = DEFAULTS.seeds,
     random_seeds: Annotated[int, arg(metavar="N")] = 3,
-    jobs: Annotated[int | None, arg(metavar="N")] = None,
-    json: Annotated[Path | None, arg(metavar="FILE")] = None,
-    picture: Annotated[Path | None, arg(metavar="FILE.png")] = None,
-    page: Annotated[Path | None, arg(metavar="FILE.md")] = None,
+    jobs: Annotated[int | None, optional("N")] = None,
+    json: Annotated[Path | None, optional("FILE")] = None,
+    picture: Annotated[Path | None, optional("FILE.png")] = None,
+    page: Annotated[Path | None, optional("FILE.md")] = None,
 ) -> None:
     """Compare ways of choosing measurements: how good a model does a budget buy?
 

@@ -31,6 +31,7 @@ from selective_depth.drivers.source import (
     SourceTimeoutError,
     open_source,
 )
+from selective_depth.selectors.acquire import MOST_ROUNDS
 from selective_depth.selectors.parallel import default_threads
 
 log = logging.getLogger(__name__)
@@ -76,7 +77,7 @@ def check(settings: Settings) -> None:
         ("--frames", run.frames, "1 or more", run.frames is None or run.frames >= 1),
         ("--threads", run.threads, "1 or more", run.threads is None or run.threads >= 1),
         ("--budget", spend.budget, "a share between 0 and 1", 0 <= spend.budget <= 1),
-        ("--rounds", spend.rounds, "between 1 and 255", 1 <= spend.rounds <= 255),
+        ("--rounds", spend.rounds, f"from 1 to {MOST_ROUNDS}", 1 <= spend.rounds <= MOST_ROUNDS),
         ("--near-mm", seen.near_mm, "0 or more", (seen.near_mm or 0) >= 0),
         ("--far-mm", far_mm, "more than --near-mm", far_mm > (seen.near_mm or 0)),
     ):

@@ -141,6 +141,7 @@ def test_completion_knows_the_commands(shell: str, capsys: pytest.CaptureFixture
         (["replay", "x", "--threads", "0"], "--threads is 0"),
         (["replay", "x", "--budget", "2"], "--budget is 2.0; it must be a share between 0 and 1"),
         (["replay", "x", "--rounds", "0"], "--rounds is 0"),
+        (["replay", "x", "--rounds", "255"], "--rounds is 255; it must be from 1 to 254"),
         (["replay", "x", "--near-mm", "900", "--far-mm", "800"], "--far-mm is 800"),
         (["replay", "x", "--settings"], "--settings needs a file"),
         (["replay", "x", "--settings", "no.toml"], "'no.toml' does not exist"),

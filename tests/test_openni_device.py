@@ -57,14 +57,17 @@ def wait_for(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
 
 
 def next_frame(device: OpenNIDevice, timeout_s: float = RECOVERY_S) -> DepthFrame:
-    """The next frame, reading on through every outage."""
-    deadline = time.monotonic() + timeout_s
+    """The next frame after a fault has been taken away, reading on through the outage."""
+    start_s = time.monotonic()
     while True:
         try:
-            return device.read(timeout_s=0.1)
+            frame = device.read(timeout_s=0.1)
         except (SourceTimeoutError, DeviceLostError):
-            if time.monotonic() > deadline:
+            if time.monotonic() > start_s + timeout_s:
                 raise
+        else:
+            print(f"\nback after {time.monotonic() - start_s:.2f} s")
+            return frame
 
 
 def live_run(count: int) -> None:
