@@ -506,7 +506,8 @@ def run(arguments: Sequence[str]) -> int:
     debug = _take(words, "--debug")
     verbose = _take(words, "-v", "--verbose")
     try:
-        return _dispatch(words, verbose)
+        with interrupt.recognised():
+            return _dispatch(words, verbose)
     except BrokenPipeError:  # whoever read the output has seen enough, as in `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED

@@ -1,8 +1,9 @@
 """Ctrl-C that always works, within three seconds and whatever is going on.
 
 Python raises KeyboardInterrupt wherever it happens to be, and loses it where nothing may be
-raised: in a callback of an import, in a destructor. So it is noted as well, for the loop to
-look at; and if all else fails, a watchdog ends the program.
+raised: in a callback of an import, in a destructor; in a call of a compiled function it becomes a
+SystemError. So it is noted as well, for the loop to look at and for errors to be known by; and if
+all else fails, a watchdog ends the program.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NoReturn
 
 EXIT_CODE = 130
@@ -39,6 +42,16 @@ def check() -> None:
     """Raise the KeyboardInterrupt that was asked for, should it have been lost."""
     if _asked.is_set():
         raise KeyboardInterrupt
+
+
+@contextmanager
+def recognised() -> Iterator[None]:
+    """Raise KeyboardInterrupt in place of any error that comes after Ctrl-C."""
+    try:
+        yield
+    except Exception:
+        check()
+        raise
 
 
 def leave() -> NoReturn:

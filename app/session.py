@@ -146,7 +146,8 @@ class Session:
             if seen.serve:
                 say(f"Serving on {seen.serve_address}; join with 'rerun {viewer.served_url}'.")
             try:
-                self._turn_all(source, loop, viewer)
+                with interrupt.recognised():
+                    self._turn_all(source, loop, viewer)
                 if seen.serve and not report.live:
                     say("All frames are served; Ctrl-C ends.")
                     threading.Event().wait()

@@ -11,14 +11,15 @@ import numpy.typing as npt
 from selective_depth.drivers.frame import Camera, DepthFrame
 
 
-def cell_centres(pixels: int, cells: int) -> npt.NDArray[np.int32]:
+def cell_centres(pixels: int, cells: int, name: str = "seeds") -> npt.NDArray[np.int32]:
     """Pixel at the centre of each of `cells` equal cells along an axis of `pixels` pixels.
 
-    ``floor((i + 0.5) * pixels / cells)``, in integers so that no rounding moves a seed.
+    ``floor((i + 0.5) * pixels / cells)``, in integers so that no rounding moves a seed. If they do
+    not fit, the error calls them by `name`.
     """
     if not 1 <= cells <= pixels:
         raise ValueError(
-            f"{cells} seeds do not fit on {pixels} pixels; give between 1 and {pixels}"
+            f"{cells} {name} do not fit on {pixels} pixels; give between 1 and {pixels}"
         )
     return ((2 * np.arange(cells, dtype=np.int64) + 1) * pixels // (2 * cells)).astype(np.int32)
 
@@ -94,7 +95,8 @@ class SeedGrid:
         if depth_mm.ndim != 2:
             raise ValueError(f"depth_mm must have shape (height, width), got {depth_mm.shape}")
         height, width = depth_mm.shape
-        rows, columns = cell_centres(height, shape[0]), cell_centres(width, shape[1])
+        rows = cell_centres(height, shape[0], "rows of seeds")
+        columns = cell_centres(width, shape[1], "columns of seeds")
         seeds = depth_mm[np.ix_(rows, columns)].astype(np.float32)
         seeds[~(np.isfinite(seeds) & (seeds > 0))] = 0
         given = None
