@@ -178,7 +178,7 @@ def outcomes(
     SourceNotFoundError
         If the sources hold no frame with depth.
     """
-    _check(every, frames, budgets, rounds, random_seeds, strategies)
+    _check(every, frames, budgets, rounds, random_seeds, strategies, jobs)
     names = [n for n in STRATEGIES if n in strategies or n in ("uniform", "oracle")]
     chosen = list(frames_of(sources, every, frames))
     if not chosen:
@@ -214,12 +214,14 @@ def _check(
     rounds: int,
     random_seeds: int,
     strategies: Sequence[str],
+    jobs: int | None,
 ) -> None:
     for name, value in (("every", every), ("rounds", rounds), ("random-seeds", random_seeds)):
         if value < 1:
             raise UsageError(f"--{name} is {value}; it must be at least 1.")
-    if frames is not None and frames < 1:
-        raise UsageError(f"--frames is {frames}; it must be at least 1.")
+    for name, limit in (("frames", frames), ("jobs", jobs)):
+        if limit is not None and limit < 1:
+            raise UsageError(f"--{name} is {limit}; it must be at least 1.")
     for budget in budgets:
         if not 0 < budget <= 1:
             raise UsageError(

@@ -46,7 +46,7 @@ class Handover(Generic[T]):
     Attributes
     ----------
     dropped : int
-        Items that never reached the sink.
+        Items that never reached the sink, or that it failed or stalled over.
     ready : threading.Event
         Set once the sink is open, or has failed to.
     failure : Exception or None
@@ -71,6 +71,7 @@ class Handover(Generic[T]):
         self._patience_s = patience_s
         self._capacity = capacity
         self._queue: deque[T] = deque()
+        self._in_hand = 0  # 1 while the sink takes an item
         self._changed = threading.Condition()
         self._finishing = False
         self._stalled = False
@@ -110,9 +111,10 @@ class Handover(Generic[T]):
             self._finishing = True
             self._changed.notify_all()
         self._thread.join(timeout_s)
-        if self._thread.is_alive():
-            self.dropped += len(self._queue)
-            return False
+        with self._changed:
+            if self._thread.is_alive():
+                self.dropped += len(self._queue) + self._in_hand
+                return False
         return True
 
     def _full(self) -> bool:
@@ -128,15 +130,17 @@ class Handover(Generic[T]):
         except Exception as error:  # noqa: BLE001 - whoever hands over must hear of it
             with self._changed:
                 self.failure = error
-                self.dropped += len(self._queue)
+                self.dropped += len(self._queue) + self._in_hand
                 self._queue.clear()
                 self._changed.notify_all()
             self.ready.set()
 
     def _next(self) -> T | None:
         with self._changed:
+            self._in_hand = 0
             self._changed.wait_for(lambda: self._queue or self._finishing)
             self._stalled = False
             item = self._queue.popleft() if self._queue else None
+            self._in_hand = int(item is not None)
             self._changed.notify_all()
             return item

@@ -108,6 +108,8 @@ class Loop:
         with compiling_beside():
             self._improvement.select(SeedGrid.from_frame(frame, (options.rows, options.columns)))
         self.turn(frame)
+        if self._pending is not None:
+            self._pending.result()
         self.times.clear()
 
     def turn(self, frame: DepthFrame, state: str = "replay") -> Step:

@@ -111,7 +111,7 @@ class FilePlace(Place):
         self._sure_bytes = 0
         self._checked_s = time.monotonic()
         try:
-            with path.open("wb"):
+            with path.open("ab"):  # what is there goes only when the run begins
                 pass
         except OSError as error:
             raise OutputError(
@@ -189,11 +189,15 @@ class RemotePlace(Place):
         self.url = url
         self._checked_s = 0.0
         parts = urlsplit(url)
+        try:
+            port = parts.port
+        except ValueError as error:
+            raise ViewerError(f"'{url}' is no viewer's address: {error}.") from None
         if parts.scheme not in ("rerun", "rerun+http", "rerun+https") or not parts.hostname:
             raise ViewerError(
                 f"'{url}' is no viewer's address; write --connect rerun+http://HOST:PORT/proxy."
             )
-        self._address = (parts.hostname, parts.port or VIEWER_PORT)
+        self._address = (parts.hostname, port or VIEWER_PORT)
         if not listens(self._address):
             raise ViewerError(
                 f"no viewer listens at {url}. Start one there with 'rerun', or leave out --connect."
@@ -252,9 +256,12 @@ def listens(address: tuple[str, int]) -> bool:
 
 def _host_and_port(address: str) -> tuple[str, int]:
     host, _, port = address.rpartition(":")
-    if not host or not port.isdigit() or not 0 < int(port) < 65536:
-        raise ViewerError(f"'{address}' is no address to serve on; write HOST:PORT, 127.0.0.1:9876")
-    return host.strip("[]"), int(port)
+    if not host or ":" in host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ViewerError(
+            f"'{address}' is no address to serve on; write HOST:PORT, such as 127.0.0.1:9876 (the"
+            " server takes no IPv6 address)."
+        )
+    return host, int(port)
 
 
 class Viewer:
@@ -294,12 +301,12 @@ class Viewer:
         index = frames is not None and frames <= INDEXED_FRAMES
         self.window = not options.headless and has_display()
         self._places: list[Place] = []
-        if options.save is not None:
-            self._places.append(FilePlace(options.save, options, times, index=index))
         if options.serve:
             self._places.append(ServedPlace(options, times))
         if options.connect is not None:
             self._places.append(RemotePlace(options.connect, options, times))
+        if options.save is not None:
+            self._places.insert(0, FilePlace(options.save, options, times, index=index))
         if self.window:
             self._places.append(WindowPlace(options, times))
         self._ways: list[Handover[Step | StateNote]] = []
@@ -338,6 +345,12 @@ class Viewer:
             way.offer(item)
             if isinstance(place, FilePlace) and way.failure is not None:
                 raise way.failure
+
+    @property
+    def file_failed(self) -> bool:
+        """Whether a file that was asked for ended before its time."""
+        pairs = zip(self._places, self._ways, strict=True)
+        return any(isinstance(place, FilePlace) and way.failure for place, way in pairs)
 
     @property
     def dropped(self) -> dict[str, int]:

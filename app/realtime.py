@@ -9,7 +9,6 @@ from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.source import (
     DepthSource,
     SourceEndedError,
-    SourceError,
     SourceTimeoutError,
 )
 
@@ -36,20 +35,21 @@ class RealtimeSource(DepthSource):
         self.dropped = 0
         self._changed = threading.Condition()
         self._newest: DepthFrame | None = None
-        self._end: SourceError | None = None
+        self._end: Exception | None = None
         self._closing = threading.Event()
-        self._reads = 0
+        self._first_taken = self._asked_again = False
         self._thread = threading.Thread(target=self._play, name="realtime", daemon=True)
         self._thread.start()
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         """Return the newest frame that has not been read; see `DepthSource.read`."""
         with self._changed:
-            self._reads += 1
+            self._asked_again = self._first_taken
             self._changed.notify_all()
             self._changed.wait_for(lambda: self._newest or self._end, timeout_s)
             if self._newest is not None:
                 frame, self._newest = self._newest, None
+                self._first_taken = True
                 return frame
             if self._end is not None:
                 raise self._end
@@ -70,7 +70,7 @@ class RealtimeSource(DepthSource):
             first = self._source.read()
             self._hand_over(first)
             with self._changed:
-                self._changed.wait_for(lambda: self._reads > 1 or self._closing.is_set())
+                self._changed.wait_for(lambda: self._asked_again or self._closing.is_set())
             start_s = time.perf_counter()
             while not self._closing.is_set():
                 frame = self._source.read()
@@ -78,7 +78,7 @@ class RealtimeSource(DepthSource):
                 if self._closing.wait(max(0.0, due_s - time.perf_counter())):
                     return
                 self._hand_over(frame)
-        except SourceError as error:
+        except Exception as error:  # noqa: BLE001 - a reader must hear of it, whatever it is
             if isinstance(error, SourceEndedError):
                 # The last frame is on show for as long as every other one.
                 self._closing.wait(1 / self.fps)

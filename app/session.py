@@ -27,6 +27,7 @@ from selective_depth.drivers.source import (
     DamagedRecordingError,
     DepthSource,
     DeviceLostError,
+    OutputError,
     SourceEndedError,
     SourceTimeoutError,
     open_source,
@@ -91,7 +92,13 @@ def _with_a_place(options: ViewerOptions, uri: str) -> ViewerOptions:
     if asked or has_display():
         return options
     path = Path("out", "live.rrd" if uri.startswith("openni") else "replay.rrd")
-    path.parent.mkdir(exist_ok=True)
+    try:
+        path.parent.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot write '{path}': {error.strerror}. Name another file with --save, or none with"
+            " --headless."
+        ) from None
     say(f"No display here: saving to {path} instead; open it with 'rerun {path}'.")
     return dataclasses.replace(options, save=path)
 
@@ -155,6 +162,8 @@ class Session:
                 self._code = INTERRUPTED
             finally:
                 report.troubles += viewer.close()
+                if viewer.file_failed and self._code == OK:
+                    self._code = FAILED
                 report.missed = viewer.dropped
                 report.dropped = source.dropped - report.dropped_starting
                 report.stages = loop.times.summary()

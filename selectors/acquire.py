@@ -17,6 +17,8 @@ from selective_depth.selectors.seeds import SeedGrid
 Measure = Callable[[npt.NDArray[np.int32]], npt.NDArray[np.generic]]
 """A random-access depth sensor: pixels (n, 2), column first, to depth (n,) in mm, 0 = none."""
 
+MOST_MM = np.iinfo(np.uint16).max
+
 MOST_ROUNDS = 254
 """Rounds are counted in a byte, and an image of them needs one value for "never"."""
 
@@ -47,7 +49,7 @@ class Acquisition:
         Pixels measured, column first, in the order of measuring; seeds first.
     depth_mm : uint16 array of shape (n,)
         Depth; 0 = no return (kept: it was paid for, and it marks a hole). float32 if the sensor
-        answers in floats.
+        answers in floats, or in numbers beyond 65,535.
     round : uint8 array of shape (n,)
         Round in which each was measured, 0 = seed.
     frame_shape : tuple of int
@@ -157,7 +159,7 @@ def acquire(
         answer = np.asarray(measure(new_uv))
         new_mm = answer.astype(np.float32)
         new_mm[~(np.isfinite(new_mm) & (new_mm > 0))] = 0
-        whole &= np.issubdtype(answer.dtype, np.integer)
+        whole &= np.issubdtype(answer.dtype, np.integer) and new_mm.max(initial=0) <= MOST_MM
         if new_mm.shape != (len(new_uv),):
             raise ValueError(
                 f"the sensor was asked for {len(new_uv)} pixels and answered with shape"

@@ -225,7 +225,7 @@ def reconstruct(
 def samples_image(
     uv: npt.NDArray[np.integer], depth_mm: npt.NDArray[np.generic], shape: tuple[int, int]
 ) -> npt.NDArray[np.float32]:
-    """Samples on their pixels, float32 (H, W), 0 elsewhere; checks what it is given."""
+    """Samples that returned depth on their pixels, float32 (H, W), 0 elsewhere; checked."""
     uv = np.asarray(uv)
     depth_mm = np.asarray(depth_mm)
     height, width = shape
@@ -241,5 +241,5 @@ def samples_image(
         )
     image = np.zeros(shape, np.float32)
     image[uv[:, 1], uv[:, 0]] = depth_mm
-    image[~np.isfinite(image)] = 0
+    image[~(np.isfinite(image) & (image > 0))] = 0
     return image

@@ -59,22 +59,25 @@ def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[npt.NDArray[np.int32], f
     reach_px = HOLE_STEPS * pitch_px
     added: list[npt.NDArray[np.int64]] = []
     spent = 0
-    sides = False
+    centred = False  # whether the middles of the cells are in
+    height, width = seeds.frame_shape
     while pitch_px > COARSE_PX and min(len(rows), len(columns)) > 1:
-        row_middles = _middles(rows, seeds.frame_shape[0])
-        column_middles = _middles(columns, seeds.frame_shape[1])
-        if sides:
-            new = np.concatenate((_grid(rows, column_middles), _grid(row_middles, columns)))
-            rows = np.union1d(rows, row_middles)
-            columns = np.union1d(columns, column_middles)
-        else:
-            new = _grid(row_middles, column_middles)
+        row_middles, column_middles = _middles(rows, height), _middles(columns, width)
+        centres = _grid(row_middles, column_middles)
+        sides = np.concatenate((_grid(rows, column_middles), _grid(row_middles, columns)))
+        # Where an axis is full or nearly so, cells have no middles: their sides come at once.
+        halve = centred or len(centres) < (len(rows) - 1) * (len(columns) - 1)
+        new = sides if centred else np.concatenate((centres, sides)) if halve else centres
         if spent + len(new) > SHARE * shots:
             break
         spent += len(new)
         added.append(new)
-        pitch_px /= 2**0.5
-        sides = not sides
+        if halve:
+            rows, columns = np.union1d(rows, row_middles), np.union1d(columns, column_middles)
+            pitch_px = max(height / len(rows), width / len(columns))
+        else:
+            pitch_px /= 2**0.5
+        centred = not halve
     if not added or not len(seeds.uv):
         return np.empty((0, 2), np.int32), seed_pitch_px(seeds)
     uv = np.concatenate(added)
