@@ -273,7 +273,7 @@ def screenshot(
     (f"{PROGRAM} snapshot frames/ --budget 0.05 --out pictures", "with what was acquired"),
 )
 def snapshot(
-    sources: Annotated[tuple[str, ...], arg(metavar="SOURCE...")],
+    sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
     out: Annotated[Path, arg(metavar="DIR")] = Path("snapshot"),
     frame: Annotated[int, arg(metavar="N")] = 0,
@@ -409,7 +409,7 @@ def bench(
     frames: Annotated[int | None, optional("N")] = None,
     json: Annotated[Path | None, optional("FILE")] = None,
     page: Annotated[Path | None, optional("FILE.md")] = None,
-    peers: bool = True,
+    no_peers: Flag = False,
 ) -> None:
     """Time every stage of the loop, and the same work in other libraries, on this machine.
 
@@ -423,13 +423,13 @@ def bench(
         Write the figures to a file as well.
     page : Path
         Write the benchmark page of the documentation.
-    peers : bool
-        Time the peers that are installed (pip install 'selective-depth[bench]').
+    no_peers : bool
+        Leave out the peers that are installed (pip install 'selective-depth[bench]').
     """
     from selective_depth.app.bench_report import run_bench
     from selective_depth.app.samples import bundled_recording
 
-    run_bench(source or bundled_recording(), frames, json=json, page=page, peers=peers)
+    run_bench(source or bundled_recording(), frames, json=json, page=page, peers=not no_peers)
 
 
 @command(
@@ -587,6 +587,9 @@ def _say(words: str) -> None:
 def main() -> NoReturn:
     """Entry point of the console script."""
     interrupt.install()
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started this
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 - for good
     code = run(sys.argv[1:])
     if code == INTERRUPTED:
         interrupt.leave()

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -21,7 +23,7 @@ from selective_depth.app.errors import UsageError
 from selective_depth.app.strategies import STRATEGIES, Case
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.source import SourceNotFoundError, open_source
-from selective_depth.selectors.acquire import shots_of
+from selective_depth.selectors.acquire import MOST_ROUNDS, shots_of
 from selective_depth.selectors.parallel import default_threads
 from selective_depth.selectors.reconstruct import reconstruct
 
@@ -114,9 +116,20 @@ def _evaluate_frame(
     return outcomes
 
 
-def _one_thread() -> None:
+def _begin_worker() -> None:
     # Frames are spread over processes; threads inside them would only fight for the cores.
     os.environ["SELECTIVE_DEPTH_THREADS"] = "1"
+    # Ctrl-C goes to all processes of a terminal: the parent says what becomes of it, and a worker
+    # ends with its parent, however that ends.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def frames_of(sources: Sequence[str], every: int, frames: int | None) -> Iterator[DepthFrame]:
@@ -178,6 +191,8 @@ def outcomes(
     SourceNotFoundError
         If the sources hold no frame with depth.
     """
+    if not sources:
+        raise UsageError("no source was named; give recordings, folders or scenes.")
     _check(every, frames, budgets, rounds, random_seeds, strategies, jobs)
     names = [n for n in STRATEGIES if n in strategies or n in ("uniform", "oracle")]
     chosen = list(frames_of(sources, every, frames))
@@ -196,7 +211,8 @@ def outcomes(
     else:
         # Spawned, not forked: the parent may hold threads and locks of other libraries.
         spawn = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_one_thread) as pool:
+        pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_worker)
+        try:
             waiting = {
                 pool.submit(_evaluate_frame, frame, *arguments): number
                 for number, frame in enumerate(chosen)
@@ -204,6 +220,9 @@ def outcomes(
             for future in as_completed(waiting):
                 found[waiting[future]] = future.result()
                 progress(len(found), len(chosen))
+        finally:
+            # After Ctrl-C, frames under way are not waited for.
+            pool.shutdown(wait=len(found) == len(chosen), cancel_futures=True)
     return [outcome for number in sorted(found) for outcome in found[number]]
 
 
@@ -216,9 +235,13 @@ def _check(
     strategies: Sequence[str],
     jobs: int | None,
 ) -> None:
+    if not budgets:
+        raise UsageError("--budget names no share; give one or more, such as 0.05 0.10.")
     for name, value in (("every", every), ("rounds", rounds), ("random-seeds", random_seeds)):
         if value < 1:
             raise UsageError(f"--{name} is {value}; it must be at least 1.")
+    if rounds > MOST_ROUNDS:
+        raise UsageError(f"--rounds is {rounds}; it must be at most {MOST_ROUNDS}.")
     for name, limit in (("frames", frames), ("jobs", jobs)):
         if limit is not None and limit < 1:
             raise UsageError(f"--{name} is {limit}; it must be at least 1.")

@@ -31,6 +31,8 @@ def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
     int
         Exit code: 0 if nothing is wrong (or a repaired file was written), else 1.
     """
+    if not timeout_s > 0:
+        raise UsageError(f"--timeout is {timeout_s:g}; it must be more than 0.")
     with waiting(f"Checking {path}"):
         report = inspect_oni(path, decode=True, timeout_s=timeout_s)
     _print_check(report)

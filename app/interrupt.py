@@ -30,6 +30,9 @@ def install() -> None:
     """Take Ctrl-C and the system's request to end, which is treated alike."""
     signal.signal(signal.SIGINT, _on_signal)
     signal.signal(signal.SIGTERM, _on_signal)
+    # `leave` lets no destructor run. What processes shared is then cleared away by Python's
+    # tracker of such things, which need not warn of it.
+    os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
 
 
 def allow(seconds: float) -> None:

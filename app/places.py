@@ -9,6 +9,7 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import BinaryIO
 from urllib.parse import urlsplit
 
 from selective_depth.app.errors import ViewerError
@@ -111,13 +112,20 @@ class FilePlace(Place):
         self._sure_bytes = 0
         self._checked_s = time.monotonic()
         try:
-            with path.open("ab"):  # what is there goes only when the run begins
-                pass
+            self._held = path.open("ab")  # what is there goes only when the run begins
+            free = shutil.disk_usage(path.parent).free
         except OSError as error:
             raise OutputError(
                 f"cannot write '{path}': {error.strerror}. Name a file in a folder that exists and"
                 " is yours to write."
             ) from None
+        if not _lock(self._held):
+            raise OutputError(f"another run is writing '{path}'; name another file.")
+        if free < 2 * SPARE_BYTES:
+            raise OutputError(
+                f"cannot write '{path}': {free >> 20} MiB are free there, and a run leaves"
+                f" {SPARE_BYTES >> 20} MiB of a disk alone. Make room, or name a file elsewhere."
+            )
 
     def put(self, item: Step | StateNote) -> None:
         """Log a step, if the disk has room for it."""
@@ -137,6 +145,7 @@ class FilePlace(Place):
         if self._recording is not None:
             self._make_sure(CLOSE_S)
             self._recording.finish()
+        self._held.close()
 
     def _connect(self) -> Recording:
         return Recording.to_file(self.path, self.options, index=self._index)
@@ -252,6 +261,20 @@ def listens(address: tuple[str, int]) -> bool:
             return True
     except OSError:
         return False
+
+
+def _lock(file: BinaryIO) -> bool:
+    """Keep other runs from writing a file, for as long as it is open; False if one does."""
+    if sys.platform != "win32":
+        import fcntl
+
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True  # a file system without locks
+    return True
 
 
 def _host_and_port(address: str) -> tuple[str, int]:

@@ -16,6 +16,8 @@ from selective_depth.app.step import Step
 from selective_depth.app.timing import StageSummary
 from selective_depth.drivers.source import OutputError
 
+HEADING = "Settings of a run of selective-depth"
+
 
 @dataclass
 class Mean:
@@ -111,7 +113,8 @@ def print_report(report: RunReport) -> None:
     for name, missed in report.missed.items():
         table.add_row(f"not shown in {name}", f"{missed:,}", "frames")
     table.add_row("samples with depth", f"{report.samples.value:,.0f}", "per frame")
-    table.add_row("quantisation error", f"{report.quantisation_error_mm.value:.1f}", "mm")
+    if report.quantisation_error_mm.count:
+        table.add_row("quantisation error", f"{report.quantisation_error_mm.value:.1f}", "mm")
     if report.rmse_mm.count:
         table.add_row("model RMSE", f"{report.rmse_mm.value:.1f}", "mm")
     console.print(table)
@@ -132,6 +135,12 @@ def print_report(report: RunReport) -> None:
         console.print(f"note: {trouble}", soft_wrap=True)
 
 
+def is_settings(path: Path) -> bool:
+    """Whether a file is one that `save_settings` wrote."""
+    with path.open("rb") as file:
+        return file.read(len(HEADING) + 2) == f"# {HEADING}".encode()
+
+
 def save_settings(path: Path, settings: Settings, source: str) -> None:
     """Write the settings of a run so that ``--settings`` reads them back.
 
@@ -141,7 +150,7 @@ def save_settings(path: Path, settings: Settings, source: str) -> None:
         If the file cannot be written.
     """
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    heading = f"Settings of a run of selective-depth {version('selective-depth')}, {made}."
+    heading = f"{HEADING} {version('selective-depth')}, {made}."
     text = to_toml(settings, f"{heading}\nsource: {source}".replace("\r", " "))
     try:
         path.write_text(text, encoding="utf-8")

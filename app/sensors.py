@@ -60,7 +60,7 @@ def record_sensor(
         Exit code: 0, 1 if frames are missing, 130 after Ctrl-C.
     """
     for option, value in (("--frames", frames), ("--seconds", seconds)):
-        if value is not None and value <= 0:
+        if value is not None and not value > 0:  # NaN is not either
             raise UsageError(f"{option} is {value}; it must be more than 0.")
     interrupt.check()
     interrupt.allow(interrupt.SAVE_S)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import re
 import threading
 import time
 from collections import deque
@@ -18,7 +19,14 @@ from selective_depth.app.output import write_picture
 from selective_depth.app.places import Viewer, has_display
 from selective_depth.app.progress import FrameProgress, waiting
 from selective_depth.app.realtime import RealtimeSource
-from selective_depth.app.report import RunReport, count_samples, print_report, save_settings, say
+from selective_depth.app.report import (
+    RunReport,
+    count_samples,
+    is_settings,
+    print_report,
+    save_settings,
+    say,
+)
 from selective_depth.app.settings import Settings, ViewerOptions
 from selective_depth.app.step import StateNote, Step
 from selective_depth.app.stills import StillRow, contact_sheet
@@ -38,6 +46,7 @@ from selective_depth.selectors.parallel import default_threads
 log = logging.getLogger(__name__)
 
 OK, FAILED, INTERRUPTED = 0, 1, interrupt.EXIT_CODE
+MEMORY = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%", re.IGNORECASE)
 POLL_S = 0.5
 """How long a live sensor may be silent before its state is shown."""
 
@@ -84,6 +93,32 @@ def check(settings: Settings) -> None:
     ):
         if not good:
             raise UsageError(f"{option} is {value}; it must be {allowed}.")
+    for option, size in (
+        ("--serve-memory", seen.serve_memory),
+        ("--viewer-memory", seen.viewer_memory),
+    ):
+        if not MEMORY.fullmatch(size):
+            raise UsageError(f"{option} is '{size}'; it must be a size, such as 256MiB or 25%.")
+    if seen.save is not None:
+        _check_save(seen.save)
+
+
+def _check_save(path: Path) -> None:
+    """Refuse a name that is none of a Rerun recording, or whose neighbours would be lost."""
+    if path.suffix.lower() != ".rrd":
+        raise UsageError(f"--save is '{path}'; it must end in .rrd, as Rerun recordings do.")
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise UsageError(f"--save is {str(path)!r}; Rerun writes names in UTF-8 only.") from None
+    settings, picture = path.with_suffix(".toml"), path.with_suffix(".png")
+    ours = settings.is_file() and is_settings(settings)
+    for beside in (settings, picture):
+        if beside.exists() and not ours:
+            raise UsageError(
+                f"--save is '{path}', but '{beside}', which would be replaced by what is written"
+                " beside it, is not of an earlier run. Give another name."
+            )
 
 
 def _with_a_place(options: ViewerOptions, uri: str) -> ViewerOptions:
@@ -165,6 +200,7 @@ class Session:
                 if viewer.file_failed and self._code == OK:
                     self._code = FAILED
                 report.missed = viewer.dropped
+                report.state = _state(source)
                 report.dropped = source.dropped - report.dropped_starting
                 report.stages = loop.times.summary()
             if seen.save is not None and self.last is not None:

@@ -71,10 +71,19 @@ def snapshot(sources: Sequence[str], number: int, folder: Path, settings: Settin
 
     Raises
     ------
+    UsageError
+        If there is no source, or one has no such frame.
     OutputError
         If the folder or a picture cannot be written.
     """
-    rows = [still_row(nth_frame(uri, number), short_name(uri), settings) for uri in sources]
+    if not sources:
+        raise UsageError("no source was named; give recordings, folders or scenes.")
+    names = [short_name(uri) for uri in sources]
+    rows = []
+    for at, (uri, name) in enumerate(zip(sources, names, strict=True)):
+        again = names[:at].count(name)
+        title = f"{name}-{again + 1}" if again else name
+        rows.append(still_row(nth_frame(uri, number), title, settings))
     written = [folder / "sheet.png"]
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -210,6 +210,8 @@ def write_text(
     colour: tuple[int, int, int] = INK,
 ) -> int:
     """Draw text in place and return the column where it ends."""
+    # A name of bytes that are no UTF-8 would crash OpenCV.
+    text = text.encode("utf-8", "replace").decode()
     (end, _), _ = cv2.putText(
         image, text, (left, baseline), colour, cv2.FontFace("sans"), size, weight
     )

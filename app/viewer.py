@@ -30,6 +30,7 @@ from selective_depth.drivers.source import OutputError
 from selective_depth.selectors.regions import RegionSelection
 
 APPLICATION = "selective-depth"
+_MAGIC = b"RRF2"
 DEPTH_COLOURS = legend.palette(cv2.COLORMAP_VIRIDIS)
 CENTRE = np.float32(0.5)
 """Rerun puts pixel centres at halves, we at whole numbers."""
@@ -551,10 +552,21 @@ def screenshot(recording: Path, frame: int | None = None) -> npt.NDArray[np.uint
     Raises
     ------
     ViewerError
-        If the viewer does not run here; it needs a graphics driver (Mesa's lavapipe will do).
+        If there is no such recording, or the viewer does not run here; it needs a graphics driver
+        (Mesa's lavapipe will do).
     """
     from rerun.experimental import ViewerClient
 
+    try:
+        with recording.open("rb") as file:
+            magic = file.read(len(_MAGIC))
+    except OSError as error:
+        raise ViewerError(f"'{recording}' cannot be shown: {error.strerror}.") from None
+    if magic != _MAGIC:
+        raise ViewerError(
+            f"'{recording}' is no Rerun recording; 'selective-depth replay SOURCE --save"
+            " FILE.rrd' makes one."
+        )
     # The viewer complains on the terminal where there is none, as on a server.
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
     with socket.create_server(("127.0.0.1", 0)) as free:

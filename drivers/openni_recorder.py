@@ -91,7 +91,7 @@ def record(
     """
     path = Path(out_path)
     # Under another name until the sensor streams: an older recording is not lost for nothing.
-    unborn = path.with_name(path.name + ".part")
+    unborn = path.parent / f"{path.name}.part"
     file = _create(path, unborn, overwrite)
     try:
         worker = Worker(
@@ -186,15 +186,15 @@ def _follow(worker: Worker, progress: Callable[[int], None] | None) -> tuple[str
 
 
 def _verify(path: Path, seen: int) -> tuple[int, str]:
-    """Tidy up a finished recording, count its frames, and have OpenNI2 itself open it again."""
-    report = inspect_oni(path)
+    """Tidy up a finished recording, decode its frames, and have OpenNI2 itself open it again."""
+    report = inspect_oni(path, decode=True)
     frames = report.readable_frames
     if frames == 0:
         return 0, f"'{path}' holds no frame."
     if not report.complete:
         what = f" ({report.problems[0].sentence.rstrip('.')})" if report.problems else ""
         return frames, (
-            f"'{path}' was not written to its end{what}. `selective-depth check '{path}' --repair"
+            f"'{path}' is not whole{what}. `selective-depth check '{path}' --repair"
             f" OUT.oni` saves its {frames} frames."
         )
     # The recorder leaves as many zeros after the end as there are bytes before it.

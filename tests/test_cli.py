@@ -21,7 +21,7 @@ import pytest
 from rerun.chunk import RrdReader
 from virtual_sensor import VirtualSensor
 
-from selective_depth.app import cli, session
+from selective_depth.app import cli, places, session
 from selective_depth.app.command import COMMANDS, SHELLS, parse
 from selective_depth.app.settings import (
     GasOptions,
@@ -30,6 +30,7 @@ from selective_depth.app.settings import (
     ViewerOptions,
     to_toml,
 )
+from selective_depth.drivers.source import OutputError
 
 pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 ROOT = Path(__file__).parent.parent
@@ -142,6 +143,14 @@ def test_completion_knows_the_commands(shell: str, capsys: pytest.CaptureFixture
         (["replay", "x", "--budget", "2"], "--budget is 2.0; it must be a share between 0 and 1"),
         (["replay", "x", "--rounds", "0"], "--rounds is 0"),
         (["replay", "x", "--rounds", "255"], "--rounds is 255; it must be from 1 to 254"),
+        (["replay", "x", "--serve-memory", "much"], "--serve-memory is 'much'"),
+        (["snapshot"], "no source was named"),
+        (["evaluate"], "no source was named"),
+        (["evaluate", "x", "--budget"], "--budget names no share"),
+        (["evaluate", "x", "--jobs", "0"], "--jobs is 0"),
+        (["evaluate", "x", "--rounds", "300"], "--rounds is 300"),
+        (["check", "x.oni", "--timeout", "nan"], "--timeout is nan"),
+        (["record", "x.oni", "--seconds", "nan"], "--seconds is nan"),
         (["replay", "x", "--near-mm", "900", "--far-mm", "800"], "--far-mm is 800"),
         (["replay", "x", "--settings"], "--settings needs a file"),
         (["replay", "x", "--settings", "no.toml"], "'no.toml' does not exist"),
@@ -246,10 +255,77 @@ def test_no_runtime(
         assert str(tmp_path) in line
 
 
-@pytest.mark.parametrize("place", ["missing/out.rrd", "."])
+@pytest.mark.parametrize("place", ["missing/out.rrd", "folder.rrd"])
 def test_unwritable_output(place: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "folder.rrd").mkdir()
     _, line = refuse(capsys, "replay", ENDLESS, *QUICK, "--save", str(tmp_path / place))
     assert "cannot write" in line
+
+
+@pytest.mark.parametrize(
+    ("there", "name", "words"),
+    [
+        ("mine.oni", "mine.oni", "it must end in .rrd"),
+        ("mine.toml", "mine.rrd", "mine.toml', which would be replaced"),
+        ("mine.png", "mine.rrd", "mine.png', which would be replaced"),
+        ("x", "s\udcff.rrd", "UTF-8"),
+    ],
+)
+def test_saving_never_replaces_what_is_of_no_earlier_run(
+    there: str, name: str, words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / there).write_text("precious")
+    code, line = refuse(capsys, "replay", ENDLESS, *QUICK, "--save", str(tmp_path / name))
+    assert code == 2
+    assert words in line
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["precious"]
+
+
+def test_saving_replaces_an_earlier_run(tmp_path: Path) -> None:
+    for _ in range(2):
+        arguments = ["replay", ENDLESS, *QUICK, "--frames", "2", "--save", str(tmp_path / "a.rrd")]
+        assert cli.run(arguments) == 0
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_save_that_fails_at_its_end_is_a_failed_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(place: places.FilePlace, item: object) -> None:
+        raise OutputError("the disk went away")
+
+    monkeypatch.setattr(places.FilePlace, "put", fail)
+    out = tmp_path / "a.rrd"
+    assert cli.run(["replay", ENDLESS, *QUICK, "--frames", "1", "--save", str(out)]) == 1
+    shown = capsys.readouterr().out
+    assert "the disk went away" in shown
+    assert "1  frames" in next(line for line in shown.splitlines() if "not shown in" in line)
+
+
+def test_a_picture_of_nothing_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    picture = str(tmp_path / "a.png")
+    assert "No such file" in refuse(capsys, "screenshot", str(tmp_path / "no.rrd"), picture)[1]
+    (tmp_path / "a.rrd").write_text("no recording")
+    assert "no Rerun recording" in refuse(capsys, "screenshot", str(tmp_path / "a.rrd"), picture)[1]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="children are read from /proc")
+def test_an_interrupted_evaluation_leaves_no_process(tmp_path: Path) -> None:
+    process = start("evaluate", "virtual:ball?frames=30", "--every", "1", cwd=tmp_path)
+    workers = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    deadline_s = time.monotonic() + 30
+    while len(children := workers.read_text().split()) < 2:  # a worker, and Python's tracker
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=5)  # whoever holds the pipes would make it wait
+    assert process.returncode == 130
+    assert errors.splitlines()[-1] == "selective-depth: interrupted."
+    while any(Path(f"/proc/{child}").exists() for child in children):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
 
 
 def test_nobody_at_the_viewers_address(capsys: pytest.CaptureFixture[str]) -> None:

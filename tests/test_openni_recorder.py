@@ -74,6 +74,20 @@ def test_frames_whose_last_pixel_differs_replay_bit_for_bit(
             np.testing.assert_array_equal(frame.depth_mm, frames[index % 4])
 
 
+def test_frames_that_cannot_be_decoded_are_told(
+    virtual_sensor: VirtualSensor, tmp_path: Path
+) -> None:
+    def disturb(frames: int) -> None:
+        if frames == 6:
+            virtual_sensor.set(odd=1)  # frames of half the height, which are recorded as well
+
+    report = record(tmp_path / "out.oni", frames=20, progress=disturb)
+    assert report.ended == "done"
+    assert 6 <= report.frames < 20
+    assert "is not whole (frame" in report.problem
+    assert "--repair" in report.problem
+
+
 def test_so_long_as_asked(virtual_sensor: VirtualSensor, tmp_path: Path) -> None:
     report = record(tmp_path / "out.oni", duration_s=0.5)
     assert report.ended == "done"

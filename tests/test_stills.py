@@ -13,7 +13,8 @@ from selective_depth.app.errors import UsageError
 from selective_depth.app.settings import AcquireOptions, GasOptions, Settings
 from selective_depth.app.snapshot import short_name, snapshot, still_row
 from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.drivers.source import OutputError
+from selective_depth.drivers.recorded import write_folder
+from selective_depth.drivers.source import OutputError, open_source
 
 SMALL = Settings(gas=GasOptions(nodes=300), acquire=AcquireOptions(budget=0.02, rounds=2))
 
@@ -92,6 +93,15 @@ def test_no_text_leaves_its_panel(row: stills.StillRow) -> None:
         for width in (300, 520):
             assert stills.text_width(panel.caption, 19 if width >= 420 else 16, 600) < width
             assert stills.finished(panel, width).shape[1] == width
+
+
+def test_snapshots_of_one_name_and_of_strange_names_are_all_written(tmp_path: Path) -> None:
+    frames = tmp_path / "frames\udcff"  # a name that is no UTF-8
+    with open_source("virtual:ball?size=320x240&frames=1") as source:
+        write_folder(frames, source)
+    written = snapshot([str(frames), str(frames)], 0, tmp_path / "out", SMALL)
+    assert len(written) == 11
+    assert set(written) == set((tmp_path / "out").iterdir())
 
 
 def test_snapshot_writes_the_sheet_and_every_panel(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -189,6 +190,38 @@ def test_colour_limits_hold_for_the_whole_run(tmp_path: Path) -> None:
 def test_unwritable_file_is_refused_at_once(tmp_path: Path, place: str) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / place)
     with pytest.raises(OutputError, match="cannot write"):
+        places.Viewer(chosen, live=False, times=StageTimes())
+
+
+def test_a_refused_run_leaves_an_older_file_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "old.rrd").write_bytes(b"precious")
+    chosen = dataclasses.replace(
+        HEADLESS, save=tmp_path / "old.rrd", connect="rerun+http://127.0.0.1:1/proxy"
+    )
+    with pytest.raises(ViewerError, match="no viewer listens"):
+        places.Viewer(chosen, live=False, times=StageTimes())
+    assert (tmp_path / "old.rrd").read_bytes() == b"precious"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX locks")
+def test_a_file_belongs_to_one_run_at_a_time(tmp_path: Path) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=2)
+    with pytest.raises(OutputError, match="another run is writing"):
+        places.Viewer(chosen, live=False, times=StageTimes())
+    shown.show(make_step(0))
+    assert shown.close() == []
+    assert len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)) == 1
+    places.Viewer(chosen, live=False, times=StageTimes()).close()
+
+
+def test_a_disk_that_is_nearly_full_is_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100 << 20))
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    with pytest.raises(OutputError, match="100 MiB are free there"):
         places.Viewer(chosen, live=False, times=StageTimes())
 
 
