@@ -86,8 +86,8 @@ class ViewerOptions:
 
     headless: Flag = False
     """Open no viewer window."""
-    save: Annotated[Path | None, optional("FILE")] = None
-    """Write everything to a Rerun recording (.rrd), and the settings beside it."""
+    save: Annotated[Path | None, optional("FILE.rrd")] = None
+    """Write everything to a Rerun recording, with the settings and a picture beside it."""
     serve: Flag = False
     """Serve a stream that viewers can join; a replay is served until Ctrl-C."""
     serve_address: Annotated[str, arg(metavar="HOST:PORT")] = "127.0.0.1:9876"

@@ -294,7 +294,8 @@ class OpenNIDevice(DepthSource):
                 misfits += 1
                 self.misfits += 1
                 if misfits >= _MISFITS:
-                    return "reconnecting", f"its frames are wrong: {message['problem']}"
+                    why = f"{misfits} wrong frames in a row; the last: {message['problem']}"
+                    return "reconnecting", why
             elif message["kind"] == "idle":
                 if message["silent_s"] > _RESTART_S:
                     return "reconnecting", f"no frame for {_RESTART_S:g} s"
