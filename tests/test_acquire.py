@@ -170,6 +170,55 @@ def test_the_score_is_its_formula(
     np.testing.assert_array_equal(score, rule.map(samples, threads=1))
 
 
+def last_vote_is_tied(samples: Samples, voters: int) -> npt.NDArray[np.bool_]:
+    """Pixels with two samples equally near for the last vote: either may have it."""
+    v, u = np.nonzero(samples.image_mm > 0)
+    if len(v) <= voters:
+        return np.zeros(samples.shape, np.bool_)
+    rows, columns = np.indices(samples.shape)
+    squared = np.sort((rows[..., None] - v) ** 2 + (columns[..., None] - u) ** 2)
+    return np.asarray(squared[..., voters - 1] == squared[..., voters])
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.builds(
+        StepScore,
+        voters=st.integers(2, 6),  # of one, the second distance is open
+        falloff=st.sampled_from([1.0, 2.0, 4.0, 5.0]),
+        gap=st.sampled_from([0.3, 0.8, 2.0]),
+        noise_mm=st.sampled_from([0.0, 1.0, 30.0]),
+    ),
+    st.integers(0, 2**32 - 1),
+)
+def test_the_score_heeds_its_parameters(rule: StepScore, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shot = rng.random((24, 50)) < 0.04
+    depth = np.where(rng.random(shot.shape) < 0.2, 0, rng.integers(1000, 1500, shot.shape))
+    samples = Samples(shot.shape)
+    samples.add(np.argwhere(shot)[:, ::-1].astype(np.int32), depth[shot])
+    clear = ~last_vote_is_tied(samples, rule.voters)
+    assert clear.any()
+    expected = score_reference(samples, rule)
+    np.testing.assert_allclose(rule.map(samples)[clear], expected[clear], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("voters", [1, 2, 4, 5])
+def test_no_score_in_a_tile_is_above_its_bound(voters: int) -> None:
+    """Of two depths, the variance can be as much as a quarter of the squared range."""
+    rng = np.random.default_rng(voters)
+    shot = rng.random((96, 128)) < 0.03
+    depth = rng.choice([1000, 2000], shot.shape)
+    samples = Samples(shot.shape)
+    samples.add(np.argwhere(shot)[:, ::-1].astype(np.int32), depth[shot])
+    rule = StepScore(voters=voters)
+    score, bound = rule.map(samples), rule._bounds(samples)
+    for row, column in np.ndindex(bound.shape):
+        top, left = row * samples.tile_px, column * samples.tile_px
+        tile = score[top : top + samples.tile_px, left : left + samples.tile_px]
+        assert tile.max() <= max(bound[row, column], 0)
+
+
 def test_the_score_is_its_formula_where_no_two_samples_are_equally_near() -> None:
     rule = StepScore()
     samples = Samples((20, 20))
@@ -287,8 +336,9 @@ def test_misuse_is_refused_in_a_sentence() -> None:
     seeds = SeedGrid.from_array(scene(0), (10, 10))
     with pytest.raises(ValueError, match="0 rounds were asked for; give between 1 and 254"):
         acquire(Sensor(scene(0)), seeds, 0.1, 0)
-    with pytest.raises(ValueError, match="voters is 7; give between 1 and 6"):
-        StepScore(voters=7)
+    for voters in (0, 7):
+        with pytest.raises(ValueError, match=f"voters is {voters}; give between 1 and 6"):
+            StepScore(voters=voters)
     with pytest.raises(ValueError, match="must return one depth per pixel"):
         acquire(lambda uv: np.zeros(3), seeds, 100, 1)
 
@@ -359,3 +409,45 @@ def test_a_sensor_that_reaches_far_and_answers_in_floats() -> None:
     np.testing.assert_array_equal(acquisition.depth_mm, expected)
     assert acquisition.depth_mm.max() > 65535
     assert sum(r.returned for r in acquisition.rounds) < 300 == acquisition.mask().sum()
+
+
+@pytest.mark.parametrize("nothing", [-1, np.nan, np.inf])
+def test_whatever_a_sensor_says_for_no_return_is_kept_as_0(nothing: float) -> None:
+    depth = scene(4)
+    answers = np.where(depth == 0, nothing, depth.astype(float))
+    if nothing == -1:
+        answers = answers.astype(np.int32)
+    seeds = SeedGrid.from_array(depth, (24, 26))
+    acquisition = acquire(lambda uv: answers[uv[:, 1], uv[:, 0]], seeds, 300, 3)
+    expected = depth[acquisition.uv[:, 1], acquisition.uv[:, 0]]
+    assert (expected[acquisition.round > 0] == 0).any()
+    np.testing.assert_array_equal(acquisition.depth_mm, expected)
+
+
+def test_whole_numbers_beyond_16_bits_keep_their_value() -> None:
+    depth = np.full((60, 80), 2000, np.int32)
+    depth[:, 40:] = 70_000
+    seeds = SeedGrid.from_array(depth, (12, 16))
+    acquisition = acquire(lambda uv: depth[uv[:, 1], uv[:, 0]], seeds, 100, 2)
+    assert acquisition.depth_mm.dtype == np.float32
+    np.testing.assert_array_equal(
+        acquisition.depth_mm, depth[acquisition.uv[:, 1], acquisition.uv[:, 0]]
+    )
+
+
+def test_one_answer_in_floats_makes_all_depth_floats() -> None:
+    """Half a millimetre of the first round must not be lost because the last one is whole."""
+    seeds = SeedGrid.from_array(np.full((60, 80), 2000, np.uint16), (12, 16))
+    answers = iter([np.float32(1999.5), np.uint16(2000)])
+    acquisition = acquire(lambda uv: np.full(len(uv), next(answers)), seeds, 100, 2)
+    assert acquisition.depth_mm.dtype == np.float32
+    assert (acquisition.depth_mm[acquisition.round == 1] == 1999.5).all()
+
+
+@pytest.mark.parametrize("shots", [307, 313])
+def test_rounds_share_the_budget_equally(shots: int) -> None:
+    depth = scene(0)
+    acquisition = acquire(Sensor(depth), SeedGrid.from_array(depth, (24, 26)), shots, 8)
+    made = [r.shots for r in acquisition.rounds]
+    assert sum(made) == shots
+    assert max(made) - min(made) <= 1

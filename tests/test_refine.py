@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from selective_depth.selectors.acquire import acquire
 from selective_depth.selectors.refine import COARSE_PX, HOLE_STEPS, SHARE, finer_lattice
-from selective_depth.selectors.samples import seed_pitch_px
+from selective_depth.selectors.samples import Samples, seed_pitch_px
+from selective_depth.selectors.scores import Plan, StepScore
 from selective_depth.selectors.seeds import SeedGrid
 
 
@@ -56,6 +57,37 @@ def test_the_gaps_shrink_as_said(shots: int, steps: int) -> None:
         axis=-1
     )
     assert gaps.max() <= pitch_px / 2**0.5 + 0.5
+
+
+@pytest.mark.parametrize(("shots", "widest_px"), [(3276, 16), (20_000, 8), (60_000, 4)])
+def test_the_pitch_is_the_widest_step_where_an_axis_is_full(shots: int, widest_px: int) -> None:
+    """Every row has seeds: one step halves the gaps along it, as nothing can come between."""
+    seeds = flat((64, 64), (64, 1024))
+    uv, pitch_px = finer_lattice(seeds, shots)
+    measured = np.zeros(seeds.frame_shape, np.bool_)
+    measured[seeds.uv[:, 1], seeds.uv[:, 0]] = True
+    measured[uv[:, 1], uv[:, 0]] = True
+    gaps_px = [np.diff(np.flatnonzero(row)).max() for row in measured]
+    assert max(gaps_px) == widest_px == pytest.approx(pitch_px, rel=0.01)
+
+
+def test_the_last_row_and_column_are_reached() -> None:
+    """12x16 seeds end 5 px before the border, half a step: the lattice goes on to the border."""
+    uv, _ = finer_lattice(flat((12, 16)), 600)
+    assert uv.max(axis=0).tolist() == [159, 119]
+
+
+def test_distances_are_judged_by_the_finer_lattice() -> None:
+    class Spy(StepScore):
+        def plan(self, samples: Samples, threads: int | None = None) -> Plan:
+            pitches_px.append(samples.pitch_px)
+            return super().plan(samples, threads)
+
+    pitches_px: list[float] = []
+    seeds = flat((12, 16))
+    for rounds in (1, 4):
+        acquire(lambda uv: np.full(len(uv), 2000, np.uint16), seeds, 2000, rounds, Spy())
+    assert pitches_px == [10, finer_lattice(seeds, 2000)[1]] == [10, 5]
 
 
 def test_a_bar_between_coarse_seeds_is_found() -> None:
