@@ -18,7 +18,7 @@ from selective_depth.app.export import save_cloud, save_depth, save_model
 from selective_depth.app.strategies import STRATEGIES, Case
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.ply import read_ply
-from selective_depth.drivers.source import OutputError, SourceNotFoundError
+from selective_depth.drivers.source import DepthSource, OutputError, SourceNotFoundError
 from selective_depth.selectors.acquire import acquire
 from selective_depth.selectors.seeds import SeedGrid
 
@@ -93,6 +93,99 @@ def test_errors_are_those_of_the_definition() -> None:
     assert wrong == pytest.approx(2 / 3)  # 19 mm is right; 61 mm > 2 %; 21 mm > 20 mm
 
 
+def test_what_returned_nothing_is_counted_among_all_measurements() -> None:
+    case = Case(frame(), SHAPE, SHOTS, 1, 0)
+    u, v = STRATEGIES["random"].pixels(case).T
+    in_hole = (v >= 20) & (v < 40) & (u >= 100) & (u < 120)
+    assert in_hole.any()
+    assert protocol.run_strategy("random", case).missed == in_hole.mean()
+
+
+def made_of(depth_mm: np.ndarray) -> Case:
+    camera = Camera.kinect(WIDTH, HEIGHT)
+    return Case(DepthFrame(depth_mm.astype(np.uint16), 0, 0, camera), SHAPE, 300, 4, 0)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_the_gradient_shoots_at_steps_either_way(upright: bool) -> None:
+    rows, columns = np.indices((HEIGHT, WIDTH))
+    place, step = (columns, 80) if upright else (rows, 60)
+    case = made_of(np.where(place < step, 1000, 2000))
+    shots = STRATEGIES["gradient"].pixels(case)[len(case.seed_uv) :]
+    assert np.abs(shots[:, 0 if upright else 1] - step).max() <= 5  # one step of the seeds
+
+
+@pytest.mark.parametrize(
+    ("name", "inside"), [("neural_gas", True), ("neural_gas_complement", False)]
+)
+def test_the_gas_shoots_in_its_regions_and_its_complement_outside(name: str, inside: bool) -> None:
+    case = Case(frame(), SHAPE, 400, 1, 0)
+    u, v = STRATEGIES[name].pixels(case)[len(case.seed_uv) :].T
+    share = case.regions.mask[v, u].mean()
+    assert (share if inside else 1 - share) > 0.9
+
+
+def test_a_spread_fills_its_mask_evenly_before_it_goes_elsewhere() -> None:
+    case = made_of(np.full((HEIGHT, WIDTH), 2000))
+    small = np.zeros((HEIGHT, WIDTH), np.bool_)
+    small[50:66, 70:86] = True
+    assert (small & case.open).sum() < case.shots
+    u, v = case.spread(small)[len(case.seed_uv) :].T
+    assert small[v, u].sum() == (small & case.open).sum()
+    tiles = case.spread(~small)[len(case.seed_uv) :] // 20
+    assert len(np.unique(tiles, axis=0)) == 48, "every part of a wide mask gets its share"
+
+
+def test_the_oracle_knows_where_nothing_returns() -> None:
+    case = Case(frame(), SHAPE, SHOTS, 1, 0)
+    shots = STRATEGIES["oracle"].pixels(case)[len(case.seed_uv) :]
+    assert len(shots) > 100
+    assert (case.frame.measure(shots) > 0).all()
+
+
+@pytest.mark.parametrize(
+    "name", [n for n in STRATEGIES if "loop" not in n and "uniform" not in n and n != "oracle"]
+)
+def test_one_shot_goes_no_farther_than_is_worth_it(name: str) -> None:
+    """1.3 steps of 5 px from a seed with depth; a hole of 70x70 pixels is mostly beyond."""
+    depth = frame().depth_mm.copy()
+    depth[20:90, 20:90] = 0
+    case = made_of(depth)
+    shots = STRATEGIES[name].pixels(case)[len(case.seed_uv) :]
+    assert len(shots) == 300
+    apart_px = np.hypot(*(shots[:, None] - case.seeds.uv[None]).transpose(2, 0, 1)).min(axis=1)
+    assert apart_px.max() <= 6.5
+
+
+class Endless(DepthSource):
+    """A source that would never stop."""
+
+    frame_count = None
+
+    def __init__(self) -> None:
+        self.index = -1
+
+    def read(self, timeout_s: float = 5.0) -> DepthFrame:
+        self.index += 1
+        assert self.index < 2 * protocol.ENDLESS_FRAMES
+        return DepthFrame(np.ones((1, 1), np.uint16), self.index, 0, Camera.kinect(1, 1))
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_source_without_end_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(protocol, "open_source", lambda uri: Endless())
+    found = [each.index for each in protocol.frames_of(["here", "there"], 1, None)]
+    assert found == 2 * list(range(protocol.ENDLESS_FRAMES))
+
+
+def test_so_many_frames_of_each_source(folder: Path) -> None:
+    for frames in (1, 2):
+        found = protocol.frames_of([str(folder)] * 2, 1, frames)
+        assert [each.index for each in found] == 2 * list(range(frames))
+
+
 def test_figures_are_those_of_the_definition() -> None:
     def outcome(name: str, strategy: str, *rmse: float) -> Outcome:
         return Outcome(name, 0.05, strategy, tuple(Errors(r, r / 2, 0.1, 9, 0.2) for r in rmse))
@@ -151,6 +244,7 @@ def test_selecting_pays_on_a_made_scene() -> None:
         ({"every": 0}, "--every is 0; it must be at least 1"),
         ({"rounds": 0}, "--rounds is 0"),
         ({"frames": 0}, "--frames is 0"),
+        ({"jobs": 0}, "--jobs is 0; it must be at least 1"),
         ({"budgets": (1.5,)}, r"--budget is 1.5; it is a share .* such as 0\.05"),
         ({"strategies": ("gradiant",)}, "'gradiant' is no strategy; there are uniform, random"),
     ],

@@ -15,6 +15,7 @@ from selective_depth.selectors.reconstruct import (
     STEP_MM,
     nearest_sample,
     reconstruct,
+    samples_image,
 )
 from selective_depth.selectors.seeds import SeedGrid
 
@@ -199,6 +200,35 @@ def test_shots_that_missed_and_bad_values_are_left_out() -> None:
     np.testing.assert_array_equal(with_misses, without)
 
 
+@pytest.mark.parametrize("value", [-800.0, np.inf, -np.inf, np.nan])
+def test_what_is_no_depth_is_no_sample(value: float) -> None:
+    uv = np.array([(1, 1), (5, 1), (1, 5)], np.int32)
+    depth = np.array([800, 900, value])
+    assert samples_image(uv, depth, (7, 7))[5, 1] == 0
+    np.testing.assert_array_equal(
+        reconstruct(uv, depth, (7, 7)), reconstruct(uv[:2], depth[:2], (7, 7))
+    )
+
+
+@pytest.mark.parametrize(
+    ("corners", "span_mm", "bridges"),
+    [
+        ([(0, 0), (20, 0), (0, 20)], STEP_MM, False),
+        ([(0, 0), (20, 0), (0, 20)], STEP_MM + 1, True),
+        ([(0, 0), (10, 0), (5, 5)], 1000, False),
+        ([(0, 0), (11, 0), (5, 5)], 1000, True),
+    ],
+)
+def test_a_bridge_exceeds_both_limits(
+    corners: list[tuple[int, int]], span_mm: float, bridges: bool
+) -> None:
+    """Just as wide or as long as a limit is still a surface."""
+    assert BRIDGE_PX == 10
+    depth = np.array([1000, 1000 + span_mm, 1000])
+    model = reconstruct(np.array(corners, np.int32), depth, (21, 21))
+    assert (len(np.unique(model)) == 2) == bridges
+
+
 def test_the_last_of_two_measurements_of_a_pixel_counts() -> None:
     uv = np.array([(1, 1), (1, 1)], np.int32)
     assert (reconstruct(uv, np.array([800, 900]), (3, 3)) == 900).all()
@@ -222,5 +252,6 @@ def test_threads_change_nothing(threads: int) -> None:
 def test_what_does_not_fit_is_refused_in_a_sentence() -> None:
     with pytest.raises(ValueError, match=r"column first.*\(3, 2\) and \(2,\)"):
         reconstruct(np.zeros((3, 2), int), np.zeros(2), (4, 4))
-    with pytest.raises(ValueError, match="outside the image of 4x3 pixels"):
-        reconstruct(np.array([(4, 0)]), np.array([1000]), (3, 4))
+    for outside in ((4, 0), (0, 3), (-1, 0), (0, -1)):
+        with pytest.raises(ValueError, match="outside the image of 4x3 pixels"):
+            reconstruct(np.array([outside]), np.array([1000]), (3, 4))
