@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -36,6 +37,7 @@ from selective_depth.drivers.source import (
     SourceError,
     SourceTimeoutError,
 )
+from selective_depth.selectors.acquire import Acquisition
 
 HEIGHT, WIDTH = 48, 64
 SMALL = Settings(
@@ -138,6 +140,60 @@ def test_a_live_loop_makes_the_model_of_some_frames_only() -> None:
     assert 1 <= loop.times.summary()["model"].count <= 3
 
 
+ACQUIRING = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, rounds=2))
+
+
+def test_a_model_has_no_error_where_the_frame_has_no_depth() -> None:
+    with Loop(ACQUIRING) as loop:
+        step = loop.turn(make_frame(0))
+    assert step.model is not None
+    np.testing.assert_array_equal(np.isnan(step.model.error_mm), step.frame.depth_mm == 0)
+
+
+def test_a_live_model_is_handed_out_once() -> None:
+    with Loop(ACQUIRING, realtime=True) as loop:
+        assert loop.turn(make_frame(0)).model is None
+        assert loop._pending is not None
+        made = loop._pending.result()
+        later = [loop.turn(make_frame(index)).model for index in range(1, MODEL_EVERY)]
+    assert later == [made] + [None] * (MODEL_EVERY - 2)
+
+
+def test_stage_loop_holds_what_the_loop_itself_did(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Loop(SMALL) as loop:
+        loop.warm_up(make_frame(0))
+        train = loop._gas.update if loop._live_gas else loop._gas.select
+        # As slow as to outlast all that is done beside it.
+        monkeypatch.setattr(
+            loop._gas, train.__name__, lambda seeds: (time.sleep(0.1), train(seeds))[1]
+        )
+        loop.turn(make_frame(1))
+    stages = loop.times.summary()
+    assert stages["neural_gas"].max_ms >= 100
+    assert stages["loop"].max_ms >= stages["seeds"].max_ms + stages["neural_gas"].max_ms
+
+
+def test_starting_is_over_before_times_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = Acquisition.reconstruct
+
+    def slow(self: Acquisition, threads: int | None = None) -> npt.NDArray[np.float32]:
+        time.sleep(0.1)
+        return plain(self, threads)
+
+    monkeypatch.setattr(Acquisition, "reconstruct", slow)
+    with Loop(ACQUIRING, realtime=True) as loop:
+        loop.warm_up(make_frame(0))
+    assert loop.times.summary() == {}
+
+
+def test_a_closed_loop_leaves_no_thread() -> None:
+    before = set(threading.enumerate())
+    with Loop(ACQUIRING, realtime=True) as loop:
+        loop.turn(make_frame(0))
+    left = {thread.name for thread in set(threading.enumerate()) - before}
+    assert not [name for name in left if name.startswith(("beside", "model"))]
+
+
 @pytest.mark.parametrize(("budget", "realtime"), [(0.05, False), (0.05, True), (0.0, True)])
 def test_steps_come_in_order_and_none_is_held_back_from_silence(
     budget: float, realtime: bool
@@ -227,6 +283,43 @@ def test_realtime_passes_faults_on_and_bounds_its_wait() -> None:
         with pytest.raises(SourceTimeoutError, match=r"within 0\.1 s"):
             source.read(0.1)
         release.set()
+
+
+def test_realtime_passes_on_what_no_source_should_raise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    script = Script([0])
+
+    def read(timeout_s: float = 5.0) -> DepthFrame:
+        raise OSError("the disk is gone")
+
+    monkeypatch.setattr(script, "read", read)
+    with RealtimeSource(script) as source, pytest.raises(OSError, match="the disk is gone"):
+        source.read(2)
+    assert script.closed == 1
+
+
+def test_realtime_waits_for_a_reader_that_had_to_ask_often(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Reads that timed out before the first frame do not start the clock."""
+    script = Script(list(range(12)))
+    release, plain = threading.Event(), script.read
+
+    def read(timeout_s: float = 5.0) -> DepthFrame:
+        release.wait()
+        return plain(timeout_s)
+
+    monkeypatch.setattr(script, "read", read)
+    with RealtimeSource(script) as source:
+        for _ in range(3):
+            with pytest.raises(SourceTimeoutError):
+                source.read(0.01)
+        release.set()
+        assert source.read().index == 0
+        time.sleep(0.2)
+        assert source.read().index == 1
+        assert source.dropped == 0
 
 
 @given(st.lists(st.floats(0, 1e4, width=32), min_size=1, max_size=50))
