@@ -237,6 +237,17 @@ def test_threshold_takes_the_best_and_no_halves_of_ties(seed, share, ties):
         assert mask.sum() + (rest == rest.max()).sum() > wanted
 
 
+@pytest.mark.parametrize("width", [127, 128])
+def test_the_last_column_counts_towards_the_share(width):
+    """A step along the right border is the best there is, and no two pixels are alike."""
+    depth = 2000 + np.random.default_rng(width).normal(0, 2, (48, width))
+    depth[:, -4:] -= 1000
+    found = selected(depth.astype(np.float32), (12, 16), share=0.05)
+    assert found.raw.max(axis=0).argmax() == width - 1
+    assert found.mask[:, -1].all()
+    assert found.mask.sum() == int(0.05 * found.known.sum())
+
+
 def test_scattered_samples_change_only_what_lies_near(shared_data):
     depth = frames(shared_data, "sequence", 60)[0]
     seeds = SeedGrid.from_array(depth)
