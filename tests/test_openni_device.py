@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,8 @@ from selective_depth.drivers.openni import (
     list_devices,
     runtime_version,
 )
+from selective_depth.drivers.openni_device import _Count
+from selective_depth.drivers.openni_process import Message
 from selective_depth.drivers.source import (
     DeviceLostError,
     DeviceRefusedError,
@@ -193,6 +196,59 @@ def test_a_hang_of_the_runtime_is_survived(
         os.kill(device._worker.pid, signal.SIGSTOP)
         wait_for(lambda: device.restarts == 1)
         sensor_frame(next_frame(device))
+
+
+def test_a_stall_that_lasts_is_ended_by_opening_it_afresh(
+    virtual_sensor: VirtualSensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("selective_depth.drivers.openni_device._STALL_S", 0.1)
+    monkeypatch.setattr("selective_depth.drivers.openni_device._RESTART_S", 0.3)
+    with OpenNIDevice() as device:
+        device.read()
+        virtual_sensor.set(stall=1)
+        wait_for(lambda: device.state == "stalled")
+        assert device.restarts == 0
+        wait_for(lambda: device.restarts == 1)
+        virtual_sensor.set(stall=0)
+        sensor_frame(next_frame(device))
+
+
+def test_a_fault_of_our_own_reaches_the_reader(
+    virtual_sensor: VirtualSensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(self: _Count, message: Message) -> tuple[int, int]:
+        raise ZeroDivisionError("on purpose")
+
+    with OpenNIDevice() as device:
+        device.read()
+        monkeypatch.setattr(_Count, "follow", fail)
+        with pytest.raises(ZeroDivisionError, match="on purpose"):
+            for _ in range(3):  # what came before may still be read
+                device.read(timeout_s=1)
+
+
+def test_numbers_and_times_go_on_rising(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(now_s=100.0, monotonic=lambda: clock.now_s)
+    monkeypatch.setattr("selective_depth.drivers.openni_device.time", clock)
+    count = _Count()
+
+    def follow(index: int, timestamp_us: int) -> tuple[int, int]:
+        return count.follow({"index": index, "timestamp_us": timestamp_us})
+
+    assert follow(7, 50_000) == (0, 50_000)
+    assert follow(9, 120_000) == (2, 120_000), "gaps are kept: frames were lost"
+    # The sensor counts from 1 again, but its clock goes on.
+    assert follow(1, 150_000) == (3, 150_000)
+    assert follow(2, 180_000) == (4, 180_000)
+    # It is opened afresh after two and a half seconds: its clock starts again as well.
+    count.restart()
+    clock.now_s += 2.5
+    assert follow(0, 33) == (5, 2_680_000)
+    assert follow(3, 90_033) == (8, 2_770_000)
+    # The same where its own numbers went on meanwhile: they tell nothing about the outage.
+    count.restart()
+    clock.now_s += 1
+    assert follow(900, 5_000_000) == (9, 3_770_000)
 
 
 def test_a_slow_sensor_is_no_fault(virtual_sensor: VirtualSensor) -> None:
