@@ -72,12 +72,14 @@ class _Count:
         """Number and timestamp of a frame in the life of this source."""
         index, timestamp_us = int(message["index"]), int(message["timestamp_us"])
         now = time.monotonic()
-        if self._fresh and self._number >= 0:
+        renumbered = self._fresh or index + self._add_number <= self._number
+        if renumbered:
+            self._add_number = self._number + 1 - index
+        turned_back = renumbered and timestamp_us + self._add_us <= self._timestamp_us
+        if self._number >= 0 and (self._fresh or turned_back):
             # The outage takes as long on our clock as it took on the wall.
             away_us = round((now - self._seen_s) * 1e6)
-            self._add_us = self._timestamp_us + away_us - timestamp_us
-        if self._fresh or index + self._add_number <= self._number:
-            self._add_number = self._number + 1 - index
+            self._add_us = self._timestamp_us + max(away_us, 1) - timestamp_us
         self._fresh = False
         self._seen_s = now
         self._number = index + self._add_number
@@ -275,6 +277,8 @@ class OpenNIDevice(DepthSource):
             with self._changed:
                 self._failure = error
                 self._changed.notify_all()
+        finally:
+            self._worker.close()
 
     def _follow(self) -> tuple[str, str]:
         """Take frames in until something is wrong; return the new state and the reason."""

@@ -17,8 +17,6 @@ from selective_depth.selectors.seeds import SeedGrid
 Measure = Callable[[npt.NDArray[np.int32]], npt.NDArray[np.generic]]
 """A random-access depth sensor: pixels (n, 2), column first, to depth (n,) in mm, 0 = none."""
 
-MOST_MM = np.iinfo(np.uint16).max
-
 MOST_ROUNDS = 254
 """Rounds are counted in a byte, and an image of them needs one value for "never"."""
 
@@ -106,6 +104,10 @@ def _shares(shots: int, rounds: int, first: int) -> list[int]:
     return given + [first + (shots - first) * (n + 1) // count for n in range(count)]
 
 
+def _fits_16_bits(depth_mm: npt.NDArray[np.float32]) -> bool:
+    return bool(depth_mm.max(initial=0) <= np.iinfo(np.uint16).max)
+
+
 def acquire(
     measure: Measure,
     seeds: SeedGrid,
@@ -151,7 +153,8 @@ def acquire(
     plan = score.plan(samples, threads)
     lattice_uv = seeds.lattice_uv.reshape(-1, 2)
     lattice_mm = seeds.depth_mm.ravel()
-    uv, depth, whole = [lattice_uv], [lattice_mm], True
+    uv, depth = [lattice_uv], [lattice_mm]
+    whole = _fits_16_bits(lattice_mm) and bool((lattice_mm % 1 == 0).all())
     made: list[Round] = []
     for due in _shares(shots, rounds, len(even_uv)):
         spent = sum(r.shots for r in made)
@@ -159,7 +162,7 @@ def acquire(
         answer = np.asarray(measure(new_uv))
         new_mm = answer.astype(np.float32)
         new_mm[~(np.isfinite(new_mm) & (new_mm > 0))] = 0
-        whole &= np.issubdtype(answer.dtype, np.integer) and new_mm.max(initial=0) <= MOST_MM
+        whole &= np.issubdtype(answer.dtype, np.integer) and _fits_16_bits(new_mm)
         if new_mm.shape != (len(new_uv),):
             raise ValueError(
                 f"the sensor was asked for {len(new_uv)} pixels and answered with shape"

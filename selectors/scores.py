@@ -332,7 +332,7 @@ class StepScore(Score):
     Parameters
     ----------
     voters : int, default 5
-        How many samples vote, 1 to 6. 4 see a step too late; 8, tried before, blurred it.
+        How many samples vote, 2 to 6. 4 see a step too late; 8, tried before, blurred it.
     falloff : float, default 4
         How fast a vote fades with distance. 3 is better in one shot and 5 in a closed loop: the
         slower it fades, the wider the band about a strong step that is shot all over before a
@@ -352,8 +352,8 @@ class StepScore(Score):
     name = "step score"
 
     def __post_init__(self) -> None:
-        if not 1 <= self.voters <= _SLOTS:
-            raise ValueError(f"voters is {self.voters}; give between 1 and {_SLOTS}")
+        if not 2 <= self.voters <= _SLOTS:  # the gap is told by two
+            raise ValueError(f"voters is {self.voters}; give between 2 and {_SLOTS}")
 
     def map(self, samples: Samples, threads: int | None = None) -> Image:
         """Score of every pixel (see `Score.map`)."""

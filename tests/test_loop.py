@@ -117,6 +117,21 @@ def test_live_goes_on_through_stall_and_loss(monkeypatch: pytest.MonkeyPatch) ->
     assert session.report.live
 
 
+def test_the_report_tells_the_sensors_last_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Script([0, 1, DeviceLostError("unplugged")], live=True)
+
+    def read(
+        timeout_s: float = 5.0, plain: Callable[[float], DepthFrame] = source.read
+    ) -> DepthFrame:
+        if source.state == "lost":
+            raise KeyboardInterrupt
+        return plain(timeout_s)
+
+    monkeypatch.setattr(source, "read", read)
+    code, session = run(monkeypatch, source)
+    assert (code, session.report.frames, session.report.state) == (130, 2, "lost")
+
+
 def test_what_is_lost_while_starting_is_counted_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     source = Script([0, 8, 9, 12], live=True)
 

@@ -225,6 +225,7 @@ def test_a_fault_of_our_own_reaches_the_reader(
         with pytest.raises(ZeroDivisionError, match="on purpose"):
             for _ in range(3):  # what came before may still be read
                 device.read(timeout_s=1)
+        wait_for(lambda: not is_running(device._worker.pid))
 
 
 def test_numbers_and_times_go_on_rising(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,10 +246,13 @@ def test_numbers_and_times_go_on_rising(monkeypatch: pytest.MonkeyPatch) -> None
     clock.now_s += 2.5
     assert follow(0, 33) == (5, 2_680_000)
     assert follow(3, 90_033) == (8, 2_770_000)
+    # Both start again without its being opened: it was away for a second.
+    clock.now_s += 1
+    assert follow(1, 33) == (9, 3_770_000)
     # The same where its own numbers went on meanwhile: they tell nothing about the outage.
     count.restart()
     clock.now_s += 1
-    assert follow(900, 5_000_000) == (9, 3_770_000)
+    assert follow(900, 5_000_000) == (10, 4_770_000)
 
 
 def test_a_slow_sensor_is_no_fault(virtual_sensor: VirtualSensor) -> None:
