@@ -11,9 +11,11 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,6 +127,19 @@ def _begin_worker() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
+@contextmanager
+def _started_deaf_to_ctrl_c() -> Iterator[None]:
+    """Let processes that start meanwhile be deaf to Ctrl-C from their first moment."""
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -211,18 +226,23 @@ def outcomes(
     else:
         # Spawned, not forked: the parent may hold threads and locks of other libraries.
         spawn = multiprocessing.get_context("spawn")
+        others = set(multiprocessing.active_children())
         pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_worker)
         try:
-            waiting = {
-                pool.submit(_evaluate_frame, frame, *arguments): number
-                for number, frame in enumerate(chosen)
-            }
+            with _started_deaf_to_ctrl_c():
+                waiting = {
+                    pool.submit(_evaluate_frame, frame, *arguments): number
+                    for number, frame in enumerate(chosen)
+                }
             for future in as_completed(waiting):
                 found[waiting[future]] = future.result()
                 progress(len(found), len(chosen))
         finally:
-            # After Ctrl-C, frames under way are not waited for.
-            pool.shutdown(wait=len(found) == len(chosen), cancel_futures=True)
+            done = len(found) == len(chosen)
+            if not done:  # after Ctrl-C, say: what is under way is not waited for
+                for worker in set(multiprocessing.active_children()) - others:
+                    worker.kill()
+            pool.shutdown(wait=done, cancel_futures=True)
     return [outcome for number in sorted(found) for outcome in found[number]]
 
 
