@@ -52,6 +52,8 @@ class RunReport:
         Frames lost while everything was got ready with the first one.
     dropped : int
         Frames lost since then.
+    state : str
+        The sensor's at the end.
     """
 
     source: str
@@ -77,7 +79,6 @@ class RunReport:
     def take(self, step: Step) -> None:
         """Add a step."""
         self.frames += 1
-        self.state = step.state
         self.samples.add(count_samples(step))
         self.quantisation_error_mm.add(step.regions.quantisation_error_mm)
         if step.model is not None:

@@ -47,6 +47,7 @@ log = logging.getLogger(__name__)
 
 OK, FAILED, INTERRUPTED = 0, 1, interrupt.EXIT_CODE
 MEMORY = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%", re.IGNORECASE)
+"""A size as the SDK reads it."""
 POLL_S = 0.5
 """How long a live sensor may be silent before its state is shown."""
 
@@ -103,6 +104,11 @@ def check(settings: Settings) -> None:
         _check_save(seen.save)
 
 
+def _beside(saved: Path) -> tuple[Path, Path]:
+    """Where the settings and the picture of a saved run go."""
+    return saved.with_suffix(".toml"), saved.with_suffix(".png")
+
+
 def _check_save(path: Path) -> None:
     """Refuse a name that is none of a Rerun recording, or whose neighbours would be lost."""
     if path.suffix.lower() != ".rrd":
@@ -111,7 +117,7 @@ def _check_save(path: Path) -> None:
         str(path).encode()
     except UnicodeEncodeError:
         raise UsageError(f"--save is {str(path)!r}; Rerun writes names in UTF-8 only.") from None
-    settings, picture = path.with_suffix(".toml"), path.with_suffix(".png")
+    settings, picture = _beside(path)
     ours = settings.is_file() and is_settings(settings)
     for beside in (settings, picture):
         if beside.exists() and not ours:
@@ -284,8 +290,9 @@ class Session:
 
     def _write_beside(self, saved: Path, *, picture: bool) -> None:
         """Settings and, where no window showed it, a picture of the last frame."""
-        beside = [saved, saved.with_suffix(".toml")]
-        save_settings(beside[1], self.settings, self._uri)
+        settings_file, picture_file = _beside(saved)
+        save_settings(settings_file, self.settings, self._uri)
+        self.report.written += [saved, settings_file]
         if picture and self.last is not None:
             step = self.last
             row = StillRow(
@@ -295,9 +302,8 @@ class Session:
                 step.improvement,
                 step.acquisition,
             )
-            beside.append(saved.with_suffix(".png"))
-            write_picture(beside[2], contact_sheet([row]))
-        self.report.written += beside
+            write_picture(picture_file, contact_sheet([row]))
+            self.report.written.append(picture_file)
 
 
 def _tell(source: DepthSource) -> None:

@@ -67,7 +67,7 @@ def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[npt.NDArray[np.int32], f
         sides = np.concatenate((_grid(rows, column_middles), _grid(row_middles, columns)))
         # Where an axis is full or nearly so, cells have no middles: their sides come at once.
         halve = centred or len(centres) < (len(rows) - 1) * (len(columns) - 1)
-        new = sides if centred else np.concatenate((centres, sides)) if halve else centres
+        new = np.concatenate(([] if centred else [centres]) + ([sides] if halve else []))
         if spent + len(new) > SHARE * shots:
             break
         spent += len(new)
