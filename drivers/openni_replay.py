@@ -147,7 +147,7 @@ def _readable_frames(path: str) -> tuple[int, str]:
     What OpenNI2 would answer with a crash is refused.
     """
     report = inspect_oni(path)
-    advice = f"`selective-depth check '{path}'` says more, and saves with --repair what is readable."
+    advice = f"`selective-depth check '{path}'` says more; with --repair it saves what it can."
     if not report.openable:
         wrong = [problem for problem in report.problems if not problem.harmless]
         what = f"{wrong[0]}" if wrong else "it holds no depth frame"
