@@ -39,6 +39,7 @@ CLOSE_S = 1.0
 """How long a place may take over its last frames, and all of them together:"""
 CLOSE_ALL_S = 2.5
 FILE_QUEUE = 8
+"""Steps of a sensor that may wait for a file, while what was written is made sure of."""
 INDEXED_FRAMES = 1000
 """Up to so many frames a file gets an index; beyond, its memory would be felt."""
 
@@ -341,7 +342,7 @@ class Viewer:
                     place,
                     lossless=file and not live,
                     patience_s=0.0 if live else STALL_S,
-                    capacity=FILE_QUEUE if file else 2,
+                    capacity=FILE_QUEUE if file and live else 2,
                 )
             )
 

@@ -58,7 +58,7 @@ class StageTimes:
         """Add one duration."""
         with self._lock:
             if name not in self._rings:
-                self._rings[name] = np.zeros(KEPT, dtype=np.float32)
+                self._rings[name] = np.full(KEPT, np.nan, np.float32)
                 self._counts[name] = 0
                 self._highest[name] = 0.0
             self._rings[name][self._counts[name] % KEPT] = duration_ms

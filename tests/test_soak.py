@@ -8,7 +8,6 @@ import signal
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +32,7 @@ from selective_depth.drivers.source import DepthSource, open_source
 FRAMES = int(os.environ.get("SOAK_FRAMES", "10000"))
 STOPPED_S = 30.0
 STATM = Path("/proc/self/statm")
+HELD = np.dtype([("megabytes", "f8"), ("files", "i8"), ("threads", "i8"), ("times_s", "f8")])
 
 
 class Watched(DepthSource):
@@ -42,17 +42,24 @@ class Watched(DepthSource):
         self.source = source
         self.uri, self.camera, self.fps = source.uri, source.camera, source.fps
         self.frame_count, self.live, self.dropped = source.frame_count, source.live, 0
-        self.megabytes: list[float] = []
-        self.files: list[int] = []
-        self.threads: list[int] = []
-        self.times_s: list[float] = []
+        # As large as it gets, and touched, from the start: what grows must be the app.
+        self._rows = np.ones(2 * max(FRAMES, 1500), HELD)
+        self._taken = 0
+
+    @property
+    def held(self) -> npt.NDArray[np.void]:
+        """What the process held at each frame, and when."""
+        return self._rows[: self._taken]
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         pages = int(STATM.read_text().split()[1])
-        self.megabytes.append(pages * os.sysconf("SC_PAGE_SIZE") / 1e6)
-        self.files.append(len(os.listdir("/proc/self/fd")))  # noqa: PTH208 - a count is enough
-        self.threads.append(threading.active_count())
-        self.times_s.append(time.monotonic())
+        self._rows[self._taken] = (
+            pages * os.sysconf("SC_PAGE_SIZE") / 1e6,
+            len(os.listdir("/proc/self/fd")),  # noqa: PTH208 - a count is enough
+            threading.active_count(),
+            time.monotonic(),
+        )
+        self._taken += 1
         frame = self.source.read(timeout_s)
         self.dropped, self.state = self.source.dropped, self.source.state
         return frame
@@ -108,9 +115,9 @@ def test_a_long_recording_can_be_replayed(
 def check(count: int, uri: str, folder: Path) -> None:
     """Watch a source in a process of its own, whose memory is then that of the app alone."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as fresh:
-        watched = fresh.submit(soak, uri, count, folder).result()
+        held, skipped = fresh.submit(soak, uri, count, folder).result()
     settled = count // 20
-    megabytes, times_s = watched.megabytes, watched.times_s
+    megabytes, times_s = held["megabytes"], held["times_s"]
     slope = np.polyfit(np.arange(settled, len(megabytes)), megabytes[settled:], 1)[0] * 1000
     span = count // 10
     first, last = (
@@ -118,29 +125,21 @@ def check(count: int, uri: str, folder: Path) -> None:
     )
     print(
         f"\n{count} frames, {megabytes[settled]:.0f} to {megabytes[-1]:.0f} MB, {slope:+.2f} MB per"
-        f" 1,000 frames; {first:.2f} then {last:.2f} frames/s, {watched.skipped} skipped"
+        f" 1,000 frames; {first:.2f} then {last:.2f} frames/s, {skipped} skipped"
     )
-    assert watched.files[-1] <= watched.files[settled], "files are left open"
-    assert watched.threads[-1] <= watched.threads[settled], "threads are left running"
-    assert max(megabytes) < 600
+    assert held["files"][-1] <= held["files"][settled], "files are left open"
+    assert held["threads"][-1] <= held["threads"][settled], "threads are left running"
+    assert megabytes.max() < 600
     if count >= 10_000:  # a shorter run says nothing of these
         assert slope < 1.0, "memory grows"
         assert abs(last / first - 1) < 0.03, "its speed changes"
 
 
-@dataclass(frozen=True)
-class Held:
-    """What a process held at each frame, and when."""
+def soak(uri: str, count: int, folder: Path) -> tuple[npt.NDArray[np.void], int]:
+    """Watch a source for so many frames, both selectors and a budget, everything saved.
 
-    megabytes: list[float]
-    files: list[int]
-    threads: list[int]
-    times_s: list[float]
-    skipped: int
-
-
-def soak(uri: str, count: int, folder: Path) -> Held:
-    """Watch a source for so many frames, both selectors and a budget, everything saved."""
+    Returns what the process held, and how many frames were skipped.
+    """
     os.environ.setdefault("RUST_LOG", "off")
     watched = Watched(open_source(uri))
     session_module.open_source = lambda _: watched
@@ -152,13 +151,7 @@ def soak(uri: str, count: int, folder: Path) -> Held:
     session = Session(uri, settings)
     assert session.run() == 0
     assert session.report.frames == count
-    return Held(
-        watched.megabytes,
-        watched.files,
-        watched.threads,
-        watched.times_s,
-        session.report.dropped,
-    )
+    return watched.held, session.report.dropped
 
 
 @pytest.mark.slow
@@ -191,8 +184,9 @@ def test_a_viewer_stopped_for_half_a_minute_slows_nothing(
         resume.cancel()
         viewer.send_signal(signal.SIGCONT)
         listener.kill()
-    gaps_s = np.diff(source.times_s[100:])
-    grown = max(source.megabytes) - source.megabytes[300]
+    gaps_s = np.diff(source.held["times_s"][100:])
+    megabytes = source.held["megabytes"]
+    grown = megabytes.max() - megabytes[300]
     print(
         f"\n{1 / gaps_s.mean():.1f} frames/s, longest gap {gaps_s.max() * 1000:.0f} ms,"
         f" {source.dropped} skipped, {session.report.missed}, {grown:+.0f} MB at most"
