@@ -14,7 +14,7 @@ import numpy as np
 
 from selective_depth.app.precompile import compiling_beside
 from selective_depth.app.settings import Settings
-from selective_depth.app.step import Model, Step
+from selective_depth.app.step import Arrival, Model, Step
 from selective_depth.app.timing import StageTimes
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import Acquisition, acquire
@@ -46,6 +46,8 @@ class _Turn:
         The other parts, in threads beside the loop.
     begun_ms : float
         How long the loop was busy with it so far.
+    stages_ms : dict of str to float
+        Duration of each stage that is done.
     """
 
     frame: DepthFrame
@@ -55,6 +57,7 @@ class _Turn:
     improving: Future[ImprovementSelection]
     modelling: Future[tuple[Acquisition | None, Model | None]]
     begun_ms: float
+    stages_ms: dict[str, float]
 
 
 class Loop:
@@ -114,9 +117,9 @@ class Loop:
 
     def turn(self, frame: DepthFrame, state: str = "replay") -> Step:
         """Make all of a frame that there is to make."""
-        return self._end(self._begin(frame, state))
+        return self._end(self._begin(Arrival(frame, state)))
 
-    def steps(self, frames: Iterable[tuple[DepthFrame, str] | None]) -> Iterator[Step]:
+    def steps(self, frames: Iterable[Arrival | None]) -> Iterator[Step]:
         """Turn all of these frames, each with its sensor's state; None where none came in time.
 
         While one is made, the next is begun: two frames with a thread for each of their parts keep
@@ -127,24 +130,27 @@ class Loop:
         under_way: deque[_Turn] = deque()
         for each in frames:
             if each is not None:
-                under_way.append(self._begin(*each))
+                under_way.append(self._begin(each))
             while len(under_way) > (0 if each is None else self._overlap):
                 yield self._end(under_way.popleft())
         while under_way:
             yield self._end(under_way.popleft())
 
-    def _begin(self, frame: DepthFrame, state: str) -> _Turn:
+    def _begin(self, arrival: Arrival) -> _Turn:
         """Take a frame's seeds, set the rest going, and train the nodes meanwhile."""
         start_s = time.perf_counter()
-        with self.times.stage("seeds"):
+        frame, stages_ms = arrival.frame, {"read": arrival.read_ms}
+        with self.times.stage("seeds", stages_ms):
             options = self._settings.seeds
             seeds = SeedGrid.from_frame(frame, (options.rows, options.columns))
-        modelling = self._beside.submit(self._acquire_and_model, frame, seeds)
-        improving = self._beside.submit(self._improve, seeds)
+        modelling = self._beside.submit(self._acquire_and_model, frame, seeds, stages_ms)
+        improving = self._beside.submit(self._improve, seeds, stages_ms)
         # In this thread, for the training of a frame begins where the last one's ended.
-        regions = self._regions(seeds)
+        regions = self._regions(seeds, stages_ms)
         begun_ms = (time.perf_counter() - start_s) * 1000
-        return _Turn(frame, state, seeds, regions, improving, modelling, begun_ms)
+        return _Turn(
+            frame, arrival.state, seeds, regions, improving, modelling, begun_ms, stages_ms
+        )
 
     def _end(self, turn: _Turn) -> Step:
         """Wait until all of a frame is made; stage "loop" is the time in `_begin` and here."""
@@ -153,7 +159,8 @@ class Loop:
         acquisition, model = turn.modelling.result()
         if acquisition is not None and model is None:
             model = self._model_of_some(turn.frame, acquisition)
-        self.times.add("loop", turn.begun_ms + (time.perf_counter() - start_s) * 1000)
+        loop_ms = turn.begun_ms + (time.perf_counter() - start_s) * 1000
+        self.times.add("loop", loop_ms)
         return Step(
             frame=turn.frame,
             seeds=turn.seeds,
@@ -162,23 +169,24 @@ class Loop:
             acquisition=acquisition,
             model=model,
             state=turn.state,
+            stages_ms=turn.stages_ms | {"loop": loop_ms},
         )
 
-    def _regions(self, seeds: SeedGrid) -> RegionSelection:
-        with self.times.stage("neural_gas"):
+    def _regions(self, seeds: SeedGrid, stages_ms: dict[str, float]) -> RegionSelection:
+        with self.times.stage("neural_gas", stages_ms):
             return self._gas.update(seeds) if self._live_gas else self._gas.select(seeds)
 
-    def _improve(self, seeds: SeedGrid) -> ImprovementSelection:
-        with self.times.stage("improvement"):
+    def _improve(self, seeds: SeedGrid, stages_ms: dict[str, float]) -> ImprovementSelection:
+        with self.times.stage("improvement", stages_ms):
             return self._improvement.select(seeds)
 
     def _acquire_and_model(
-        self, frame: DepthFrame, seeds: SeedGrid
+        self, frame: DepthFrame, seeds: SeedGrid, stages_ms: dict[str, float]
     ) -> tuple[Acquisition | None, Model | None]:
         options = self._settings.acquire
         if options.budget == 0:
             return None, None
-        with self.times.stage("acquire"):
+        with self.times.stage("acquire", stages_ms):
             acquisition = acquire(
                 frame.measure,
                 seeds,
@@ -186,7 +194,8 @@ class Loop:
                 rounds=options.rounds,
                 threads=self._threads,
             )
-        return acquisition, self._model(frame, acquisition) if not self._realtime else None
+        model = None if self._realtime else self._model(frame, acquisition, stages_ms)
+        return acquisition, model
 
     def _model_of_some(self, frame: DepthFrame, acquisition: Acquisition) -> Model | None:
         """Begin a model now and then, and return it when it is made."""
@@ -199,8 +208,13 @@ class Loop:
             self._since_model = 0
         return done.result() if done else None
 
-    def _model(self, frame: DepthFrame, acquisition: Acquisition) -> Model:
-        with self.times.stage("model"):
+    def _model(
+        self,
+        frame: DepthFrame,
+        acquisition: Acquisition,
+        stages_ms: dict[str, float] | None = None,
+    ) -> Model:
+        with self.times.stage("model", stages_ms):
             depth_mm = acquisition.reconstruct(self._threads)
             error_mm = np.abs(depth_mm - frame.depth_mm.astype(np.float32))
             error_mm[frame.depth_mm == 0] = np.nan

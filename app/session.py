@@ -28,7 +28,7 @@ from selective_depth.app.report import (
     say,
 )
 from selective_depth.app.settings import Settings, ViewerOptions
-from selective_depth.app.step import StateNote, Step
+from selective_depth.app.step import Arrival, StateNote, Step
 from selective_depth.app.stills import StillRow, contact_sheet
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.source import (
@@ -137,8 +137,8 @@ def _with_a_place(options: ViewerOptions, uri: str) -> ViewerOptions:
         path.parent.mkdir(exist_ok=True)
     except OSError as error:
         raise OutputError(
-            f"cannot write '{path}': {error.strerror}. Name another file with --save, or none with"
-            " --headless."
+            f"'{path}' cannot be written: {error.strerror}. Name another file with --save, or none"
+            " with --headless."
         ) from None
     say(f"No display here: saving to {path} instead; open it with 'rerun {path}'.")
     return dataclasses.replace(options, save=path)
@@ -228,17 +228,17 @@ class Session:
 
     def _frames(
         self, source: DepthSource, loop: Loop, viewer: Viewer, progress: FrameProgress
-    ) -> Iterator[tuple[DepthFrame, str] | None]:
-        """As many frames as asked for, each with the sensor's state; None when a sensor is silent.
+    ) -> Iterator[Arrival | None]:
+        """As many frames as asked for; None when a sensor is silent.
 
         The first is handed on when everything is ready.
         """
         state, taken = _state(source), 0
         while taken != self.settings.run.frames:
             interrupt.check()
-            frame = None
+            frame, own_ms = None, dict[str, float]()
             try:
-                with loop.times.stage("read"):
+                with loop.times.stage("read", own_ms):
                     frame = source.read(POLL_S) if source.live else source.read()
             except SourceEndedError:
                 return
@@ -262,7 +262,7 @@ class Session:
             elif taken == 1:
                 self.report.dropped_starting = source.dropped
             taken += 1
-            yield frame, state
+            yield Arrival(frame, state, own_ms["read"])
 
     def _get_ready(self, frame: DepthFrame, loop: Loop, viewer: Viewer) -> None:
         began_s = time.monotonic()
@@ -286,7 +286,8 @@ class Session:
         }
         if step.model is not None:
             figures["rmse_mm"] = step.model.rmse_mm
-        viewer.show(dataclasses.replace(step, stages_ms=loop.times.last_ms(), figures=figures))
+        stages_ms = loop.times.last_ms() | step.stages_ms
+        viewer.show(dataclasses.replace(step, stages_ms=stages_ms, figures=figures))
 
     def _write_beside(self, saved: Path, *, picture: bool) -> None:
         """Settings and, where no window showed it, a picture of the last frame."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +14,16 @@ from selective_depth.selectors.acquire import Acquisition
 from selective_depth.selectors.improvement import ImprovementSelection
 from selective_depth.selectors.regions import RegionSelection
 from selective_depth.selectors.seeds import SeedGrid
+
+
+class Arrival(NamedTuple):
+    """A frame as it came from its source."""
+
+    frame: DepthFrame
+    state: str = "replay"
+    """The sensor's, as in `Step`."""
+    read_ms: float = math.nan
+    """How long it was waited for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +62,13 @@ class Step:
     acquisition : Acquisition or None
         Seeds and what was measured besides; None without a budget.
     model : Model or None
-        The dense model, where it was made for this frame.
+        The dense model, where one is at hand: of this frame, or of one shortly before it where
+        frames do not wait.
     state : str
         The sensor's: live, stalled, lost, reconnecting; or replay.
     stages_ms : dict of str to float
-        Latest duration of each stage in milliseconds.
+        Duration of each stage in milliseconds: this frame's own, but for `log`, and for `model`
+        where frames do not wait; those are the latest.
     figures : dict of str to float
         Running figures by name, those of `legend.FIGURES`.
     """

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +16,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from selective_depth.app import interrupt, timing
 from selective_depth.app import session as session_module
-from selective_depth.app import timing
 from selective_depth.app.loop import MODEL_EVERY, Loop
+from selective_depth.app.places import Viewer
 from selective_depth.app.realtime import RealtimeSource
 from selective_depth.app.session import Session
 from selective_depth.app.settings import (
@@ -27,6 +30,7 @@ from selective_depth.app.settings import (
     Settings,
     ViewerOptions,
 )
+from selective_depth.app.step import Arrival, StateNote, Step
 from selective_depth.app.timing import StageTimes
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.source import (
@@ -109,6 +113,68 @@ def test_frames_limits_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (code, session.report.frames) == (0, 3)
 
 
+def test_the_rate_is_that_of_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Script(list(range(8)))
+    plain, shown_s, rates = source.read, list[float](), list[float]()
+
+    def read(timeout_s: float = 5.0) -> DepthFrame:
+        time.sleep(0.1)
+        return plain(timeout_s)
+
+    def show(self: Viewer, item: Step | StateNote) -> None:
+        assert isinstance(item, Step)
+        shown_s.append(time.monotonic())
+        rates.append(item.figures["fps"])
+
+    monkeypatch.setattr(source, "read", read)
+    monkeypatch.setattr(Viewer, "show", show)
+    _, session = run(monkeypatch, source)
+    # The first is timed from when all was ready, which nobody sees from here.
+    began_s = shown_s[0] - 1 / rates[0]
+    for count, (at_s, rate) in enumerate(zip(shown_s, rates, strict=True), start=1):
+        assert rate == pytest.approx(count / (at_s - began_s), rel=0.1)
+    assert session.report.fps == pytest.approx(rates[-1], rel=0.1)
+
+
+def test_what_places_have_missed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Viewer, "dropped", {"viewer window": 3})
+    _, session = run(monkeypatch, Script([0, 1]))
+    assert session.report.missed == {"viewer window": 3}
+
+
+def test_a_lost_ctrl_c_ends_the_run_before_the_next_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Script(list(range(50)))
+    plain, asked = source.read, threading.Event()
+
+    def read(timeout_s: float = 5.0) -> DepthFrame:
+        frame = plain(timeout_s)
+        if frame.index == 2:
+            asked.set()  # and nothing was raised
+        return frame
+
+    monkeypatch.setattr(source, "read", read)
+    monkeypatch.setattr(interrupt, "_asked", asked)
+    code, session = run(monkeypatch, source)
+    assert code == 130
+    assert session.report.frames <= 3
+
+
+@pytest.mark.parametrize("window", [False, True])
+def test_a_picture_is_written_where_no_window_showed_the_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, window: bool
+) -> None:
+    class Shown(Viewer):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            self.window = window
+
+    monkeypatch.setattr(session_module, "Viewer", Shown)
+    viewer = ViewerOptions(headless=True, save=tmp_path / "out.rrd")
+    run(monkeypatch, Script([0, 1]), dataclasses.replace(SMALL, viewer=viewer))
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"out.rrd", "out.toml"} | ({"out.png"} if not window else set())
+
+
 def test_live_goes_on_through_stall_and_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     gone = [SourceTimeoutError("silent"), DeviceLostError("unplugged"), DeviceLostError("still")]
     source = Script([0, 1, *gone, 2, 3], live=True)
@@ -188,6 +254,24 @@ def test_stage_loop_holds_what_the_loop_itself_did(monkeypatch: pytest.MonkeyPat
     assert stages["loop"].max_ms >= stages["seeds"].max_ms + stages["neural_gas"].max_ms
 
 
+def test_a_step_has_the_times_of_its_own_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the next frame is under way when it is made."""
+    arrivals = [Arrival(make_frame(index), read_ms=float(index)) for index in range(6)]
+    with Loop(ACQUIRING) as loop:
+        loop.warm_up(make_frame(0))
+        select, calls = loop._improvement.select, itertools.count()
+        monkeypatch.setattr(
+            loop._improvement,
+            "select",
+            lambda seeds: (time.sleep(0.3 * (next(calls) == 3)), select(seeds))[1],
+        )
+        steps = list(loop.steps(arrivals))
+    assert [step.stages_ms["read"] for step in steps] == [0, 1, 2, 3, 4, 5]
+    assert max(range(6), key=lambda index: steps[index].stages_ms["improvement"]) == 3
+    own = {"read", "seeds", "neural_gas", "improvement", "acquire", "model", "loop"}
+    assert all(set(step.stages_ms) == own for step in steps)
+
+
 def test_starting_is_over_before_times_count(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = Acquisition.reconstruct
 
@@ -218,13 +302,13 @@ def test_steps_come_in_order_and_none_is_held_back_from_silence(
     ahead: list[int] = []
     taken = 0
 
-    def frames() -> Iterator[tuple[DepthFrame, str] | None]:
+    def frames() -> Iterator[Arrival | None]:
         for index in range(6):
-            yield make_frame(index), f"state {index}"
+            yield Arrival(make_frame(index), f"state {index}")
             ahead.append(index + 1 - taken)
         yield None
         assert taken == 6, "a step waits for a frame that does not come"
-        yield make_frame(6), "state 6"
+        yield Arrival(make_frame(6), "state 6")
 
     with Loop(settings, realtime=realtime) as loop, Loop(settings) as plain:
         for index, step in enumerate(loop.steps(frames())):
