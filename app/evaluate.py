@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -37,6 +37,7 @@ ENDLESS_FRAMES = 120
 
 Results = dict[str, dict[str, dict[str, float]]]
 """Budget -> strategy -> figure, as the JSON file has it."""
+_Arguments = tuple[Sequence[float], int, tuple[int, int], int, Sequence[str]]
 
 
 @dataclass(frozen=True)
@@ -197,7 +198,7 @@ def outcomes(
     jobs : int, optional
         Processes; default one per processor, and 1 runs in this one.
     progress : callable, optional
-        Called with the frames done and the frames in all.
+        Called with the frames done and the frames in all, as far as they are known.
 
     Raises
     ------
@@ -210,40 +211,72 @@ def outcomes(
         raise UsageError("no source was named; give recordings, folders or scenes.")
     _check(every, frames, budgets, rounds, random_seeds, strategies, jobs)
     names = [n for n in STRATEGIES if n in strategies or n in ("uniform", "oracle")]
-    chosen = list(frames_of(sources, every, frames))
-    if not chosen:
+    jobs = jobs or default_threads()
+    arguments = (budgets, rounds, seeds_shape, random_seeds, names)
+    total = _most(sources, every, frames)
+    found: dict[int, list[Outcome]] = {}
+
+    def keep(number: int, outcomes: list[Outcome]) -> None:
+        found[number] = outcomes
+        progress(len(found), total)
+
+    progress(0, total)
+    chosen = enumerate(frames_of(sources, every, frames))
+    if min(jobs, total) == 1:
+        for number, frame in chosen:
+            keep(number, _evaluate_frame(frame, *arguments))
+    else:
+        _spread(chosen, arguments, jobs, keep)
+    if not found:
         raise SourceNotFoundError(
             f"no frame with depth in {', '.join(sources)}; give another source or --every 1."
         )
-    jobs = min(jobs or default_threads(), len(chosen))
-    arguments = (budgets, rounds, seeds_shape, random_seeds, names)
-    found: dict[int, list[Outcome]] = {}
-    progress(0, len(chosen))
-    if jobs == 1:
-        for number, frame in enumerate(chosen):
-            found[number] = _evaluate_frame(frame, *arguments)
-            progress(len(found), len(chosen))
-    else:
-        # Spawned, not forked: the parent may hold threads and locks of other libraries.
-        spawn = multiprocessing.get_context("spawn")
-        others = set(multiprocessing.active_children())
-        pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_worker)
-        try:
-            with _started_deaf_to_ctrl_c():
-                waiting = {
-                    pool.submit(_evaluate_frame, frame, *arguments): number
-                    for number, frame in enumerate(chosen)
-                }
-            for future in as_completed(waiting):
-                found[waiting[future]] = future.result()
-                progress(len(found), len(chosen))
-        finally:
-            done = len(found) == len(chosen)
-            if not done:  # after Ctrl-C, say: what is under way is not waited for
-                for worker in set(multiprocessing.active_children()) - others:
-                    worker.kill()
-            pool.shutdown(wait=done, cancel_futures=True)
+    progress(len(found), len(found))
     return [outcome for number in sorted(found) for outcome in found[number]]
+
+
+def _most(sources: Sequence[str], every: int, frames: int | None) -> int:
+    """How many frames `frames_of` finds, if all of them show something."""
+    total = 0
+    for uri in sources:
+        with open_source(uri) as source:
+            count = ENDLESS_FRAMES if source.frame_count is None else source.frame_count
+        total += min(-(-count // every), frames or count)
+    return total
+
+
+def _spread(
+    chosen: Iterator[tuple[int, DepthFrame]],
+    arguments: _Arguments,
+    jobs: int,
+    keep: Callable[[int, list[Outcome]], None],
+) -> None:
+    """Evaluate frames in so many processes, with no more of them in memory than keep these busy."""
+    # Spawned, not forked: the parent may hold threads and locks of other libraries.
+    spawn = multiprocessing.get_context("spawn")
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_worker)
+    under_way: dict[Future[list[Outcome]], int] = {}
+
+    def settle() -> None:
+        for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+            keep(under_way.pop(future), future.result())
+
+    done = False
+    try:
+        for number, frame in chosen:
+            with _started_deaf_to_ctrl_c():
+                under_way[pool.submit(_evaluate_frame, frame, *arguments)] = number
+            if len(under_way) == 2 * jobs:
+                settle()
+        while under_way:
+            settle()
+        done = True
+    finally:
+        if not done:  # after Ctrl-C, say: what is under way is not waited for
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.kill()
+        pool.shutdown(wait=done, cancel_futures=True)
 
 
 def _check(

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.app.output import cannot_write, write_output
 from selective_depth.app.stills import ROUND_COLOURS
 from selective_depth.drivers.frame import Camera
-from selective_depth.drivers.source import OutputError
 from selective_depth.selectors.acquire import Acquisition
 
 SEED_GREY = (150, 150, 150)
-
-
-def _write(path: Path, data: bytes) -> None:
-    try:
-        path.write_bytes(data)
-    except OSError as error:
-        raise OutputError(
-            f"'{path}' cannot be written ({error.strerror or error}); give a folder that exists"
-            " and is yours to write in."
-        ) from error
 
 
 def save_cloud(path: Path, acquisition: Acquisition, camera: Camera) -> int:
@@ -74,7 +65,7 @@ def save_cloud(path: Path, acquisition: Acquisition, camera: Camera) -> int:
             "end_header\n",
         )
     )
-    _write(path, header.encode("ascii") + vertex.tobytes())
+    write_output(path, header.encode("ascii") + vertex.tobytes())
     return len(vertex)
 
 
@@ -88,7 +79,7 @@ def save_depth(path: Path, depth_mm: npt.NDArray[np.floating]) -> None:
     """
     whole = np.clip(np.rint(np.nan_to_num(depth_mm)), 0, 65535).astype(np.uint16)
     _, data = cv2.imencode(".png", whole)
-    _write(path, data.tobytes())
+    write_output(path, data.tobytes())
 
 
 def save_samples(path: Path, acquisition: Acquisition) -> None:
@@ -102,20 +93,15 @@ def save_samples(path: Path, acquisition: Acquisition) -> None:
     OutputError
         If the file cannot be written.
     """
-    try:
-        with path.open("wb") as file:
-            np.savez_compressed(
-                file,
-                uv=acquisition.uv,
-                depth_mm=acquisition.depth_mm,
-                round=acquisition.round,
-                shape=np.array(acquisition.frame_shape, np.int32),
-            )
-    except OSError as error:
-        raise OutputError(
-            f"'{path}' cannot be written ({error.strerror or error}); give a folder that exists"
-            " and is yours to write in."
-        ) from error
+    packed = io.BytesIO()
+    np.savez_compressed(
+        packed,
+        uv=acquisition.uv,
+        depth_mm=acquisition.depth_mm,
+        round=acquisition.round,
+        shape=np.array(acquisition.frame_shape, np.int32),
+    )
+    write_output(path, packed.getvalue())
 
 
 def save_model(folder: Path, acquisition: Acquisition, camera: Camera) -> list[Path]:
@@ -129,9 +115,7 @@ def save_model(folder: Path, acquisition: Acquisition, camera: Camera) -> list[P
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"'{folder}' cannot be made ({error.strerror or error}); give another folder."
-        ) from error
+        raise cannot_write(folder, error) from error
     cloud, depth, samples = (folder / n for n in ("cloud.ply", "depth.png", "samples.npz"))
     save_cloud(cloud, acquisition, camera)
     save_depth(depth, acquisition.reconstruct())

@@ -24,12 +24,15 @@ SAVE_S = 15.0
 
 _asked = threading.Event()
 _patience_s = LEAVE_S
+_deferring = False
 
 
 def install() -> None:
     """Take Ctrl-C and the system's request to end, which is treated alike."""
     signal.signal(signal.SIGINT, _on_signal)
     signal.signal(signal.SIGTERM, _on_signal)
+    # It may come where Python can only report that it was raised and lost; `check` raises it again.
+    sys.unraisablehook = _unless_interrupted
     # `leave` lets no destructor run. What processes shared is then cleared away by Python's
     # tracker of such things, which need not warn of it.
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
@@ -68,10 +71,28 @@ def leave() -> NoReturn:
     os._exit(EXIT_CODE)
 
 
-def _on_signal(number: int, frame: object) -> NoReturn:
+@contextmanager
+def deferred() -> Iterator[None]:
+    """Let what happens inside, which must leave nothing half done, end before Ctrl-C is raised."""
+    global _deferring
+    _deferring = True
+    try:
+        yield
+    finally:
+        _deferring = False
+    check()
+
+
+def _unless_interrupted(lost: sys.UnraisableHookArgs) -> None:
+    if not isinstance(lost.exc_value, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+
+
+def _on_signal(number: int, frame: object) -> None:
     if not _asked.is_set():
         _asked.set()
         watchdog = threading.Timer(_patience_s, os._exit, (EXIT_CODE,))
         watchdog.daemon = True
         watchdog.start()
-    raise KeyboardInterrupt
+    if not _deferring:
+        raise KeyboardInterrupt

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,17 @@ from selective_depth.drivers.source import OutputError
 
 PICTURES = (".png", ".webp")
 _WEBP_QUALITY = 80
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+def cannot_write(path: Path, error: OSError) -> OutputError:
+    """The error of a file or folder that cannot be written: why, and what to do about it."""
+    remedy = (
+        "Make room there, or name another place."
+        if error.errno in _FULL
+        else "Name one in a folder that exists and is yours to write."
+    )
+    return OutputError(f"'{path}' cannot be written: {error.strerror or error}. {remedy}")
 
 
 def check_output(*paths: Path | None) -> None:
@@ -54,10 +66,7 @@ def write_output(path: Path, data: bytes | str) -> None:
     try:
         path.write_bytes(data.encode() if isinstance(data, str) else data)
     except OSError as error:
-        raise OutputError(
-            f"'{path}' cannot be written: {error.strerror}. Name a file in a folder that exists"
-            " and is yours to write."
-        ) from error
+        raise cannot_write(path, error) from error
 
 
 def write_picture(path: Path, image: npt.NDArray[np.uint8]) -> None:

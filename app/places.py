@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 
 from selective_depth.app.errors import ViewerError
 from selective_depth.app.handover import Handover
+from selective_depth.app.output import cannot_write
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.step import StateNote, Step
 from selective_depth.app.timing import StageTimes
@@ -116,15 +117,12 @@ class FilePlace(Place):
             self._held = path.open("ab")  # what is there goes only when the run begins
             free = shutil.disk_usage(path.parent).free
         except OSError as error:
-            raise OutputError(
-                f"cannot write '{path}': {error.strerror}. Name a file in a folder that exists and"
-                " is yours to write."
-            ) from None
+            raise cannot_write(path, error) from None
         if not _lock(self._held):
             raise OutputError(f"another run is writing '{path}'; name another file.")
         if free < 2 * SPARE_BYTES:
             raise OutputError(
-                f"cannot write '{path}': {free >> 20} MiB are free there, and a run leaves"
+                f"'{path}' cannot be written: {free >> 20} MiB are free there, and a run leaves"
                 f" {SPARE_BYTES >> 20} MiB of a disk alone. Make room, or name a file elsewhere."
             )
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from selective_depth.app.output import write_output
 from selective_depth.app.settings import Settings, to_toml
 from selective_depth.app.step import Step
 from selective_depth.app.timing import StageSummary
-from selective_depth.drivers.source import OutputError
 
 HEADING = "Settings of a run of selective-depth"
 
@@ -153,7 +153,4 @@ def save_settings(path: Path, settings: Settings, source: str) -> None:
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     heading = f"{HEADING} {version('selective-depth')}, {made}."
     text = to_toml(settings, f"{heading}\nsource: {source}".replace("\r", " "))
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"cannot write '{path}': {error.strerror}.") from None
+    write_output(path, text)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from selective_depth.app.errors import UsageError
 from selective_depth.app.loop import Loop
-from selective_depth.app.output import write_picture
+from selective_depth.app.output import cannot_write, write_picture
 from selective_depth.app.settings import Settings
 from selective_depth.app.stills import StillRow, contact_sheet, panels
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.source import OutputError, SourceEndedError, open_source
+from selective_depth.drivers.source import SourceEndedError, open_source
 
 
 def short_name(uri: str) -> str:
@@ -88,9 +88,7 @@ def snapshot(sources: Sequence[str], number: int, folder: Path, settings: Settin
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"'{folder}' cannot be made: {error.strerror}. Name another with --out."
-        ) from error
+        raise cannot_write(folder, error) from error
     write_picture(written[0], contact_sheet(rows))
     for row in rows:
         for panel in panels(row):

@@ -9,9 +9,10 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterable
+from contextlib import ExitStack
 from datetime import timedelta
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import cv2
 import numpy as np
@@ -20,18 +21,25 @@ import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
 
-from selective_depth.app import legend
-from selective_depth.app.errors import ViewerError
+from selective_depth.app import interrupt, legend
+from selective_depth.app.errors import UsageError, ViewerError
+from selective_depth.app.output import cannot_write
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.step import StateNote, Step
 from selective_depth.app.timing import STAGES
 from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.drivers.source import OutputError
 from selective_depth.selectors.regions import RegionSelection
+
+if TYPE_CHECKING:
+    from rerun.experimental import ViewerClient
 
 APPLICATION = "selective-depth"
 _MAGIC = b"RRF2"
 DEPTH_COLOURS = legend.palette(cv2.COLORMAP_VIRIDIS)
+LOAD_S = 5.0
+"""How long a viewer may show nothing while it is loading nothing."""
+PAINT_S = 30.0
+"""How long it may take to paint it."""
 SMALL_BYTES = 256 << 10
 """Less than an image of 640x480: an image makes a chunk, while small things are gathered."""
 CENTRE = np.float32(0.5)
@@ -406,10 +414,7 @@ def save_trainings(
         with path.open("wb"):
             pass
     except OSError as error:
-        raise OutputError(
-            f"cannot write '{path}': {error.strerror}. Name a file in a folder that exists and is"
-            " yours to write."
-        ) from None
+        raise cannot_write(path, error) from None
     stream = rr.RecordingStream(APPLICATION)
     stream.set_sinks(rr.FileSink(str(path)))
     StepLogger(stream, ViewerOptions(detail=True)).log_trainings(frame, trainings)
@@ -557,6 +562,8 @@ def screenshot(recording: Path, frame: int | None = None) -> npt.NDArray[np.uint
 
     Raises
     ------
+    UsageError
+        If the recording has no such frame.
     ViewerError
         If there is no such recording, or the viewer does not run here; it needs a graphics driver
         (Mesa's lavapipe will do).
@@ -577,30 +584,60 @@ def screenshot(recording: Path, frame: int | None = None) -> npt.NDArray[np.uint
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = int(free.getsockname()[1])
-    try:
-        client = ViewerClient.spawn(
-            headless=True,
-            port=port,
-            hide_welcome_screen=True,
-            executable_path=viewer_executable(),
-        )
-    except RuntimeError as error:
-        raise ViewerError(
-            f"the viewer does not start ({str(error).splitlines()[0]}). Install a graphics driver:"
-            " apt-get install mesa-vulkan-drivers libvulkan1."
-        ) from None
-    try:
-        client.open(str(recording.resolve()))
-        time.sleep(6)  # it loads and lays out in its own time and tells nobody when it is done
-        if frame is not None:
-            client.set_time("frame", sequence=frame)
-            time.sleep(2)
-        with tempfile.TemporaryDirectory() as folder:
-            picture = Path(folder) / "window.png"
-            client.save_screenshot(str(picture))
-            taken = cv2.imread(str(picture))
-    finally:
-        client.quit()
+    with ExitStack() as stack:
+        try:
+            with interrupt.deferred():
+                client = ViewerClient.spawn(
+                    headless=True,
+                    port=port,
+                    hide_welcome_screen=True,
+                    executable_path=viewer_executable(),
+                )
+                stack.callback(client.quit)
+        except RuntimeError as error:
+            raise ViewerError(
+                f"the viewer does not start ({str(error).splitlines()[0]}). Install a graphics"
+                " driver: apt-get install mesa-vulkan-drivers libvulkan1."
+            ) from None
+        _load(client, recording, frame)
+        return _settled_picture(client)
+
+
+def _load(client: ViewerClient, recording: Path, frame: int | None) -> None:
+    """Open a recording in a viewer and wait until all of it is there, at a frame if asked."""
+    client.open(str(recording.resolve()))
+    deadline_s = time.monotonic() + LOAD_S
+    while True:
+        state = client.get_state()
+        shown = [each for each in state.recordings if each.store_id == state.active_recording]
+        if shown and not state.loading:
+            break
+        if state.loading:
+            deadline_s = time.monotonic() + LOAD_S
+        elif time.monotonic() > deadline_s:
+            raise ViewerError(f"the viewer finds nothing to show in '{recording}'.")
+        time.sleep(0.1)
+    if frame is None:
+        return
+    spans = [(each.start, each.end) for each in shown[0].timelines if each.name == "frame"]
+    for first, last in spans:
+        if first is None or last is None or not first <= frame <= last:
+            raise UsageError(
+                f"--frame is {frame}; the frames of '{recording}' are {first}..{last}."
+            )
+    if not spans:
+        raise UsageError(f"--frame is {frame}, but '{recording}' has no frames, only other times.")
+    client.set_time("frame", sequence=frame, play_state="paused")  # else it plays on to the end
+
+
+def _settled_picture(client: ViewerClient) -> npt.NDArray[np.uint8]:
+    """The viewer's window, once it does not change any more: it tells nobody when it is done."""
+    deadline_s = time.monotonic() + PAINT_S
+    before, now = b"", client.take_screenshot()
+    while now != before and time.monotonic() < deadline_s:
+        time.sleep(0.5)
+        before, now = now, client.take_screenshot()
+    taken = cv2.imdecode(np.frombuffer(now, np.uint8), cv2.IMREAD_COLOR)
     if taken is None:
         raise ViewerError("the viewer made no picture. Look at the recording with 'rerun' instead.")
     return np.asarray(taken, dtype=np.uint8)

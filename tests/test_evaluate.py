@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -224,10 +226,39 @@ def test_frames_and_seeds_do_not_depend_on_how_many_processes(folder: Path) -> N
         progress=lambda a, b: told.append((a, b)),
         **options,  # type: ignore[arg-type]
     )
-    assert told == [(0, 2), (1, 2), (2, 2)]
+    assert told == [(0, 2), (1, 2), (2, 2), (2, 2)]
     assert [o.strategy for o in alone] == ["uniform", "random", "loop", "oracle"] * 2
     assert [len(o.errors) for o in alone] == [1, 2, 1, 1] * 2
     assert alone == outcomes([str(folder)], jobs=2, **options)  # type: ignore[arg-type]
+
+
+def test_no_more_frames_are_read_ahead_than_keep_the_processes_busy(
+    monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
+    plain, read, done = protocol.frames_of, 0, 0
+
+    def frames_of(*arguments: Any) -> Iterator[DepthFrame]:
+        nonlocal read
+        for each in plain(*arguments):
+            read += 1
+            assert read - done <= 4
+            yield each
+
+    def progress(now: int, total: int) -> None:
+        nonlocal done
+        done = now
+
+    monkeypatch.setattr(protocol, "frames_of", frames_of)
+    found = outcomes(
+        [str(folder)] * 5,
+        every=1,
+        budgets=(0.05,),
+        seeds_shape=SHAPE,
+        strategies=(),
+        jobs=2,
+        progress=progress,
+    )
+    assert read == done == len(found) / 2 > 8
 
 
 def test_selecting_pays_on_a_made_scene() -> None:
@@ -328,12 +359,12 @@ def test_the_model_as_files(tmp_path: Path) -> None:
 def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
     seen = frame()
     acquisition = acquire(seen.measure, SeedGrid.from_frame(seen, SHAPE), 10, 1)
-    with pytest.raises(OutputError, match=r"cloud\.ply' cannot be written \(No such file"):
+    with pytest.raises(OutputError, match=r"cloud\.ply' cannot be written: No such file"):
         save_cloud(tmp_path / "missing" / "cloud.ply", acquisition, seen.camera)
     with pytest.raises(OutputError, match="cannot be written"):
         save_depth(tmp_path / "missing" / "depth.png", np.zeros((2, 2)))
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="give another folder"):
+    with pytest.raises(OutputError, match="model' cannot be written: Not a directory"):
         save_model(tmp_path / "file" / "model", acquisition, seen.camera)
 
 

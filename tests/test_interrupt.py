@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 import threading
+import time
+from collections.abc import Callable
 
 import pytest
 
@@ -40,3 +45,82 @@ def test_a_run_interrupted_in_a_compiled_function_ends_as_any_other(
     shown = capsys.readouterr()
     assert "SystemError" not in shown.err
     assert "whole loop" in shown.out
+
+
+def run(program: str, meanwhile: Callable[[subprocess.Popen[str]], None]) -> tuple[int, str, str]:
+    """Run a program, do something once it has said a line, and return its code and what it said."""
+    lines = f"from selective_depth.app import interrupt\ninterrupt.install()\n{program}"
+    with subprocess.Popen(
+        [sys.executable, "-c", lines], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        meanwhile(process)
+        assert process.stderr is not None
+        out, err = process.stdout.read(), process.stderr.read()
+    return process.returncode, out, err
+
+
+STUBBORN = """
+import time
+print("ready", flush=True)
+while True:
+    try:
+        time.sleep(60)
+    except KeyboardInterrupt:
+        pass
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals between processes are POSIX's")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_ignores_ctrl_c_is_ended_by_the_watchdog(number: signal.Signals) -> None:
+    start_s = time.monotonic()
+    code, _, _ = run(STUBBORN, lambda process: process.send_signal(number))
+    assert code == 130
+    assert time.monotonic() - start_s < interrupt.LEAVE_S + 2
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals between processes are POSIX's")
+def test_ctrl_c_lost_in_a_destructor_is_raised_by_the_next_check_and_says_nothing() -> None:
+    program = """
+import time
+class Slow:
+    def __del__(self):
+        print("ready", flush=True)
+        time.sleep(60)
+slow = Slow()
+del slow
+try:
+    interrupt.check()
+except KeyboardInterrupt:
+    print("raised")
+"""
+    code, out, err = run(program, lambda process: process.send_signal(signal.SIGINT))
+    assert (code, out, err) == (0, "raised\n", "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals between processes are POSIX's")
+def test_what_must_not_be_left_half_done_is_done_before_ctrl_c_is_raised() -> None:
+    program = """
+import time
+try:
+    with interrupt.deferred():
+        print("ready", flush=True)
+        time.sleep(0.5)
+        print("done", flush=True)
+    print("not reached", flush=True)
+except KeyboardInterrupt:
+    print("raised", flush=True)
+"""
+    code, out, _ = run(program, lambda process: process.send_signal(signal.SIGINT))
+    assert (code, out) == (0, "done\nraised\n")
+
+
+def test_leaving_says_all_that_was_to_be_said() -> None:
+    program = """
+print("ready", flush=True)
+print("the last word")
+interrupt.leave()
+"""
+    assert run(program, lambda process: None)[:2] == (130, "the last word\n")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import http.server
+import itertools
 import os
 import shutil
 import signal
@@ -22,7 +23,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from selective_depth.app import cli, legend, places, viewer
-from selective_depth.app.errors import ViewerError
+from selective_depth.app.errors import UsageError, ViewerError
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.step import Model, StateNote, Step
 from selective_depth.app.timing import STAGES, StageTimes
@@ -189,7 +190,7 @@ def test_colour_limits_hold_for_the_whole_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize("place", ["missing/out.rrd", ".", "/proc/out.rrd"])
 def test_unwritable_file_is_refused_at_once(tmp_path: Path, place: str) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / place)
-    with pytest.raises(OutputError, match="cannot write"):
+    with pytest.raises(OutputError, match="cannot be written"):
         places.Viewer(chosen, live=False, times=StageTimes())
 
 
@@ -239,6 +240,59 @@ def test_full_disk_ends_the_file_whole(tmp_path: Path, monkeypatch: pytest.Monke
     assert len(depths) == 3
     for index, depth in enumerate(depths):
         np.testing.assert_array_equal(depth, make_step(index).frame.depth_mm)
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_a_recording_waits_for_its_file_and_a_sensor_for_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, live: bool
+) -> None:
+    go_on = threading.Event()
+    plain = viewer.Recording.log
+
+    def slow(self: viewer.Recording, item: Step | StateNote) -> None:
+        if live:
+            go_on.wait()
+        else:
+            time.sleep(0.05)
+        plain(self, item)
+
+    monkeypatch.setattr(viewer.Recording, "log", slow)
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    shown = places.Viewer(chosen, live=live, times=StageTimes(), frames=100)
+    for index in range(20):
+        shown.show(make_step(index))
+    dropped = sum(shown.dropped.values())
+    go_on.set()
+    assert shown.close() == []
+    saved = len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16))
+    assert (saved, dropped) == ((20 - dropped, 20 - saved) if live else (20, 0))
+    if live:
+        assert saved in (places.FILE_QUEUE, places.FILE_QUEUE + 1)  # and one in hand
+
+
+def test_a_write_that_fails_costs_no_more_than_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    monkeypatch.setattr(places, "CHECK_EVERY_S", 0.0)  # make sure after every step
+    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=2000)
+    plain, calls = viewer.Recording.flush, itertools.count()
+    sure: list[int] = []
+
+    def flush(self: viewer.Recording, timeout_s: float = 1e9) -> bool:
+        done = plain(self, timeout_s)
+        if next(calls) < 3:
+            sure.append((tmp_path / "out.rrd").stat().st_size)
+            return done
+        return False
+
+    monkeypatch.setattr(viewer.Recording, "flush", flush)
+    with pytest.raises(OutputError, match=r"failed after [\d,]+ bytes, which are kept"):
+        for index in range(100):
+            shown.show(make_step(index))
+    shown.close()
+    assert (tmp_path / "out.rrd").stat().st_size == sure[-1]
+    assert len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)) == 3
 
 
 @pytest.mark.parametrize(
@@ -380,6 +434,34 @@ def test_server_that_never_answers_ends_in_time() -> None:
     assert "left behind" in troubles[0]
 
 
+def test_two_that_have_stalled_are_left_behind_in_the_time_of_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        port = int(mute.getsockname()[1])
+        monkeypatch.setattr(places, "has_display", lambda: True)
+        monkeypatch.setattr(places, "VIEWER_PORT", port)
+        options = ViewerOptions(connect=f"rerun+http://127.0.0.1:{port}/proxy")
+        shown = places.Viewer(options, live=True, times=StageTimes())
+        show_for(shown, 0.5, make_step(0))
+        start_s = time.monotonic()
+        troubles = shown.close()
+    assert len(troubles) == 2
+    assert time.monotonic() - start_s < 3
+
+
+def test_a_window_goes_beside_what_is_served(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(places, "listens", lambda address: True)
+    served = ViewerOptions(serve=True, serve_address=f"127.0.0.1:{places.VIEWER_PORT}")
+    elsewhere = ViewerOptions(serve=True, serve_address="127.0.0.1:1234")
+    for options, port in (
+        (ViewerOptions(), places.VIEWER_PORT),
+        (elsewhere, places.VIEWER_PORT),
+        (served, places.VIEWER_PORT + 1),
+    ):
+        assert f":{port}/" in places.WindowPlace(options, StageTimes()).url
+
+
 def test_two_places_see_the_same(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"127.0.0.1:{free.getsockname()[1]}"
@@ -413,6 +495,38 @@ def test_window_is_opened_and_used(monkeypatch: pytest.MonkeyPatch, listener: Li
         assert shown.close() == []
         assert shown.dropped == {"viewer window": 0}
     assert opened == [listener.port]
+
+
+def test_a_picture_shows_the_frame_that_was_asked_for(tmp_path: Path) -> None:
+    steps = []
+    for index, far in enumerate((1000, 3000, 3000)):
+        made = make_step(index)
+        flat_mm = np.full((HEIGHT, WIDTH), far, np.uint16)
+        frame = dataclasses.replace(made.frame, depth_mm=flat_mm)
+        steps.append(dataclasses.replace(made, frame=frame))
+    recording = tmp_path / "out.rrd"
+    save(recording, steps, near_mm=1000, far_mm=3000)
+    try:
+        last, first = viewer.screenshot(recording), viewer.screenshot(recording, 0)
+    except ViewerError as error:
+        pytest.skip(f"no graphics driver: {error}")
+    for picture, level in ((last, 255), (first, 0)):
+        view = picture[60:380, :540].reshape(-1, 3).astype(int)
+        blue, green, red = (
+            int(viewer.DEPTH_COLOURS[level]) >> shift & 255 for shift in (8, 16, 24)
+        )
+        like = np.abs(view - (blue, green, red)).max(axis=1) < 12
+        assert like.mean() > 0.3, "the frame's depth is not what is seen of the sensor"
+    with pytest.raises(UsageError, match=r"--frame is 3; the frames of .* are 0\.\.2"):
+        viewer.screenshot(recording, 3)
+
+
+def test_a_picture_of_a_recording_that_holds_nothing_is_refused(tmp_path: Path) -> None:
+    save(tmp_path / "out.rrd", [make_step(0)])
+    data = (tmp_path / "out.rrd").read_bytes()
+    (tmp_path / "cut.rrd").write_bytes(data[:1000])
+    with pytest.raises(ViewerError, match=r"finds nothing to show|does not start"):
+        viewer.screenshot(tmp_path / "cut.rrd")
 
 
 class SlowPage(http.server.BaseHTTPRequestHandler):
