@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+import re
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,6 +34,9 @@ from selective_depth.app.settings import (
 )
 
 OK, FAILED, MISUSED, INTERRUPTED = 0, 1, 2, interrupt.EXIT_CODE
+OPTION = re.compile(r"--[\w.-]*\w")
+NARROWEST = 40
+"""Columns; in fewer, the parser's help can take for ever to find its line breaks."""
 
 EXAMPLES = (
     (f"{PROGRAM} replay virtual:workstation", "a made scene, in the viewer"),
@@ -42,7 +47,7 @@ EXAMPLES = (
 )
 
 Source = Annotated[str, arg(metavar="SOURCE")]
-SourceOrSample = Annotated[str, optional("SOURCE")]
+SourceOrSample = Annotated[str | None, optional("SOURCE")]
 Options = Annotated[Settings, arg(name="")]
 DEFAULTS = Settings()
 
@@ -55,7 +60,7 @@ DEFAULTS = Settings()
     (f"{PROGRAM} replay virtual:firehose --budget 0.05 --rounds 4", "and measure 5 % more"),
     (f"{PROGRAM} replay walk.oni --realtime --serve", "as live, for viewers elsewhere to join"),
 )
-def replay(source: SourceOrSample = "", /, settings: Options = DEFAULTS) -> int:
+def replay(source: SourceOrSample = None, /, settings: Options = DEFAULTS) -> int:
     """Replay a recording through both selectors.
 
     Parameters
@@ -68,7 +73,7 @@ def replay(source: SourceOrSample = "", /, settings: Options = DEFAULTS) -> int:
     from selective_depth.app.samples import bundled_recording
     from selective_depth.app.session import watch
 
-    return watch(source or bundled_recording(), settings)
+    return watch(bundled_recording() if source is None else source, settings)
 
 
 @command(
@@ -255,10 +260,13 @@ def screenshot(
     """
     from selective_depth.app import viewer
     from selective_depth.app.output import check_picture, write_picture
+    from selective_depth.app.progress import waiting
     from selective_depth.app.report import say
 
     check_picture(picture)
-    write_picture(picture, viewer.screenshot(recording, frame))
+    with waiting("Loading it into the viewer"):
+        taken = viewer.screenshot(recording, frame)
+    write_picture(picture, taken)
     say(f"wrote {picture}")
     return OK
 
@@ -404,7 +412,7 @@ def nodes(
     (f"{PROGRAM} bench frames/ --json out.json", "on your own, to a file as well"),
 )
 def bench(
-    source: SourceOrSample = "",
+    source: SourceOrSample = None,
     /,
     frames: Annotated[int | None, optional("N")] = None,
     json: Annotated[Path | None, optional("FILE")] = None,
@@ -429,7 +437,8 @@ def bench(
     from selective_depth.app.bench_report import run_bench
     from selective_depth.app.samples import bundled_recording
 
-    run_bench(source or bundled_recording(), frames, json=json, page=page, peers=not no_peers)
+    uri = bundled_recording() if source is None else source
+    run_bench(uri, frames, json=json, page=page, peers=not no_peers)
 
 
 @command(
@@ -525,6 +534,8 @@ def _dispatch(words: list[str], verbose: bool) -> int:
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(message)s")
     # The viewer's SDK logs in its own way to the terminal; its warnings are told in ours.
     os.environ.setdefault("RUST_LOG", "warn" if verbose else "off")
+    if shutil.get_terminal_size().columns < NARROWEST:
+        os.environ["COLUMNS"] = str(NARROWEST)
     if not words or words[0] in ("-h", "--help", "help"):
         print(overview(EXAMPLES))
         return OK
@@ -534,18 +545,21 @@ def _dispatch(words: list[str], verbose: bool) -> int:
     if words[0] == "--completion":
         print(completion(words[1] if len(words) > 1 else ""))
         return OK
-    name, rest = words[0], words[1:]
-    return invoke(name, _with_settings_file(rest))
-
-
-def _with_settings_file(words: list[str]) -> list[str]:
-    if "--settings" not in words:
-        return words
-    at = words.index("--settings")
-    if at + 1 == len(words):
+    name, typed = words[0], words[1:]
+    if "--settings" not in typed:
+        return invoke(name, typed)
+    at = typed.index("--settings")
+    if at + 1 == len(typed):
         raise UsageError("--settings needs a file: --settings FILE.toml")
-    # Before what was typed, so that what was typed wins.
-    return settings_arguments(Path(words[at + 1])) + words[:at] + words[at + 2 :]
+    file, typed = Path(typed[at + 1]), typed[:at] + typed[at + 2 :]
+    from_file = settings_arguments(file)
+    try:
+        # Before what was typed, so that what was typed wins.
+        return invoke(name, from_file + typed)
+    except UsageError as error:
+        if any(word in from_file and word not in typed for word in OPTION.findall(str(error))):
+            raise UsageError(f"{error} That option stands in '{file}'.") from None
+        raise
 
 
 def _take(words: list[str], *names: str) -> bool:

@@ -115,6 +115,12 @@ class DepthSource(ABC):
         self.close()
 
 
+_WHAT_THERE_IS = (
+    "Give an .oni file, a folder of 16-bit PNG frames, 'openni' for a sensor, or"
+    " 'virtual:workstation'."
+)
+
+
 def open_source(uri: str | Path) -> DepthSource:
     """Open any depth source by its name.
 
@@ -135,6 +141,8 @@ def open_source(uri: str | Path) -> DepthSource:
     # Each kind is imported where it is opened: a PNG folder must not need OpenNI2, and
     # `--help` must not wait for numba.
     name = str(uri)
+    if not name:  # which a path would take for this folder
+        raise SourceNotFoundError(f"a source with no name was given. {_WHAT_THERE_IS}")
     scheme, _, rest = name.partition(":")
     if name == "openni" or scheme == "openni":
         from selective_depth.drivers.openni import OpenNIDevice
@@ -163,10 +171,7 @@ def open_source(uri: str | Path) -> DepthSource:
         except RuntimeMissingError:
             return OniReader(path)  # the same frames, without OpenNI2
     if not path.exists():
-        raise SourceNotFoundError(
-            f"'{name}' does not exist. Give an .oni file, a folder of 16-bit PNG frames, 'openni'"
-            " for a sensor, or 'virtual:workstation'."
-        )
+        raise SourceNotFoundError(f"'{name}' does not exist. {_WHAT_THERE_IS}")
     raise SourceNotFoundError(
         f"'{name}' is no depth source: a recording ends in .oni, an object in .ply, and PNG frames"
         " are given by their folder."

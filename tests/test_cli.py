@@ -152,6 +152,7 @@ def test_completion_knows_the_commands(shell: str, capsys: pytest.CaptureFixture
         (["check", "x.oni", "--timeout", "nan"], "--timeout is nan"),
         (["record", "x.oni", "--seconds", "nan"], "--seconds is nan"),
         (["replay", "x", "--near-mm", "900", "--far-mm", "800"], "--far-mm is 800"),
+        (["replay", "x", "--near-mm", "900", "--far-mm", "900"], "--far-mm is 900"),
         (["replay", "x", "--settings"], "--settings needs a file"),
         (["replay", "x", "--settings", "no.toml"], "'no.toml' does not exist"),
         (["record"], "OUT.oni"),
@@ -166,13 +167,48 @@ def test_wrong_usage_is_one_line(
     assert words in line
 
 
-def test_settings_file_with_an_unknown_key_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("text", "typed", "words", "named"),
+    [
+        ("[gas]\nnodse = 3\n", [], "--gas.nodse", True),
+        ("frames = 0\n", [], "--frames is 0", True),
+        ("budget = 0.1\n", ["--frames", "0"], "--frames is 0", False),
+        ("frames = 9\n", ["--frames", "0"], "--frames is 0", False),
+    ],
+)
+def test_what_is_wrong_in_a_settings_file_is_said_to_stand_there(
+    text: str,
+    typed: list[str],
+    words: str,
+    named: bool,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    (tmp_path / "s.toml").write_text("[gas]\nnodse = 3\n")
-    code, line = refuse(capsys, "replay", "x", "--settings", str(tmp_path / "s.toml"))
+    file = tmp_path / "s.toml"
+    file.write_text(text)
+    code, line = refuse(capsys, "replay", "x", *typed, "--settings", str(file))
     assert code == 2
-    assert "nodse" in line
+    assert words in line
+    assert (f"stands in '{file}'" in line) == named
+
+
+def test_an_empty_name_is_no_sample(capsys: pytest.CaptureFixture[str]) -> None:
+    """It may be a variable of a script that was never set."""
+    for command in ("replay", "bench"):
+        code, line = refuse(capsys, command, "")
+        assert code == 1
+        assert "no name" in line
+
+
+@pytest.mark.parametrize("columns", ["1", "5", "20"])
+def test_help_in_hardly_any_columns(
+    columns: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    with pytest.raises(SystemExit) as stop:
+        cli.run(["replay", "--help"])
+    assert stop.value.code == 0
+    assert "SOURCE" in capsys.readouterr().out
 
 
 def test_settings_survive_the_round_trip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -259,7 +295,15 @@ def test_no_runtime(
 def test_unwritable_output(place: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     (tmp_path / "folder.rrd").mkdir()
     _, line = refuse(capsys, "replay", ENDLESS, *QUICK, "--save", str(tmp_path / place))
-    assert "cannot write" in line
+    assert "cannot be written" in line
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full is Linux's")
+def test_a_full_disk_is_said_to_be_full(capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["evaluate", "virtual:ball?size=64x48&frames=1", "--jobs", "1"]
+    command += ["--seeds.rows", "16", "--seeds.columns", "16", "--budget", "0.05"]
+    _, line = refuse(capsys, *command, "--json", "/dev/full")
+    assert "No space left on device. Make room there" in line
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ PROVOKED: dict[str, Provoke] = {
     "no depth frames in '…'": lambda folder, patch: ["replay", str(folder), "--headless"],
     "… is an 8-bit grey PNG": eight_bits,
     "… pixels, but this recording is …": two_sizes,
-    "cannot write '…'": lambda folder, patch: [
+    "'…' cannot be written": lambda folder, patch: [
         "replay", BALL, "--headless", "--save", str(folder / "no" / "x.rrd")
     ],
     "no viewer listens at …": nobody_listens,
