@@ -18,7 +18,7 @@ from selective_depth.app.output import cannot_write
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.step import StateNote, Step
 from selective_depth.app.timing import StageTimes
-from selective_depth.app.viewer import Recording, never_wait_at_exit, open_window
+from selective_depth.app.viewer import WRITE_S, Recording, never_wait_at_exit, open_window
 from selective_depth.drivers.source import OutputError
 
 VIEWER_PORT = 9876
@@ -34,8 +34,6 @@ STALL_S = 0.5
 """A viewer that takes longer over a step has stalled; a recording waits no more."""
 SPARE_BYTES = 64 << 20
 """Saving ends, with a whole file, when the disk has less room than this."""
-WRITE_S = 3.0
-"""A file that has not grown for so long while it should has failed."""
 CLOSE_S = 1.0
 """How long a place may take over its last frames, and all of them together:"""
 CLOSE_ALL_S = 2.5
@@ -137,7 +135,7 @@ class FilePlace(Place):
             )
         super().put(item)
         if time.monotonic() - self._checked_s > CHECK_EVERY_S:
-            self._make_sure(WRITE_S)
+            self._make_sure()
 
     def close(self) -> None:
         """Write the rest and the index."""
@@ -149,18 +147,15 @@ class FilePlace(Place):
     def _connect(self) -> Recording:
         return Recording.to_file(self.path, self.options, index=self._index)
 
-    def _make_sure(self, patience_s: float) -> None:
+    def _make_sure(self, patience_s: float = WRITE_S) -> None:
         assert self._recording is not None
-        size = self.path.stat().st_size
-        while not self._recording.flush(patience_s):
-            before, size = size, self.path.stat().st_size
-            if size == before:
-                self._recording.abandon()
-                os.truncate(self.path, self._sure_bytes)
-                raise OutputError(
-                    f"writing '{self.path}' failed after {self._sure_bytes:,} bytes, which are"
-                    " kept. Check the disk and its quota, and run it again."
-                )
+        if not self._recording.is_written(self.path, patience_s):
+            self._recording.abandon()
+            os.truncate(self.path, self._sure_bytes)
+            raise OutputError(
+                f"writing '{self.path}' failed after {self._sure_bytes:,} bytes, which are kept."
+                " Check the disk and its quota, and run it again."
+            )
         self._sure_bytes = self.path.stat().st_size
         self._checked_s = time.monotonic()
 

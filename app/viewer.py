@@ -28,6 +28,7 @@ from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.step import StateNote, Step
 from selective_depth.app.timing import STAGES
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.source import OutputError
 from selective_depth.selectors.regions import RegionSelection
 
 if TYPE_CHECKING:
@@ -40,6 +41,8 @@ LOAD_S = 5.0
 """How long a viewer may show nothing while it is loading nothing."""
 PAINT_S = 30.0
 """How long it may take to paint it."""
+WRITE_S = 3.0
+"""A file that has not grown for so long while it should has failed."""
 SMALL_BYTES = 256 << 10
 """Less than an image of 640x480: an image makes a chunk, while small things are gathered."""
 CENTRE = np.float32(0.5)
@@ -415,11 +418,17 @@ def save_trainings(
             pass
     except OSError as error:
         raise cannot_write(path, error) from None
-    stream = rr.RecordingStream(APPLICATION)
-    stream.set_sinks(rr.FileSink(str(path)))
-    StepLogger(stream, ViewerOptions(detail=True)).log_trainings(frame, trainings)
-    stream.flush()
-    stream.disconnect()
+    never_wait_at_exit()
+    recording = Recording.to_file(path, ViewerOptions(detail=True), index=True)
+    recording.log_trainings(frame, trainings)
+    if not recording.is_written(path):
+        recording.abandon()
+        if path.is_file():
+            path.unlink()
+        raise OutputError(
+            f"writing '{path}' failed. Check the disk and its quota, and run it again."
+        )
+    recording.finish()
 
 
 # Where it goes
@@ -485,12 +494,30 @@ class Recording:
         else:
             self._logger.log(item)
 
+    def log_trainings(
+        self, frame: DepthFrame, trainings: Iterable[tuple[int, RegionSelection]]
+    ) -> None:
+        """Log one frame's regions after trainings of several lengths."""
+        self._logger.log_trainings(frame, trainings)
+
     def flush(self, timeout_s: float = 1e9) -> bool:
         """Wait until everything is sent or written; False if it is not, in time or for good."""
         try:
             self._stream.flush(timeout_sec=timeout_s)
         except RuntimeError:
             return False
+        return True
+
+    def is_written(self, path: Path, patience_s: float = WRITE_S) -> bool:
+        """Wait until everything is in its file; False if that does not grow while it should.
+
+        The SDK's writer says nothing when a write fails, and never ends after it.
+        """
+        size = path.stat().st_size
+        while not self.flush(patience_s):
+            before, size = size, path.stat().st_size
+            if size == before:
+                return False
         return True
 
     def finish(self) -> None:

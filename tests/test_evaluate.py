@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -143,6 +144,18 @@ def test_the_oracle_knows_where_nothing_returns() -> None:
     shots = STRATEGIES["oracle"].pixels(case)[len(case.seed_uv) :]
     assert len(shots) > 100
     assert (case.frame.measure(shots) > 0).all()
+
+
+def test_the_oracle_shoots_at_maxima_before_what_lies_beside_them() -> None:
+    depth = np.full((HEIGHT, WIDTH), 2000, np.uint16)
+    lattice_uv = made_of(depth).seeds.lattice_uv
+    u, v = lattice_uv[10, 10]
+    depth[v + 1, u + 1 : u + 4] = 2900, 3000, 2900
+    far_u, far_v = lattice_uv[20, 20]
+    depth[far_v + 1, far_u + 1] = 2500
+    case = dataclasses.replace(made_of(depth), shots=32)  # two a batch
+    shots = STRATEGIES["oracle"].pixels(case)[len(case.seed_uv) :]
+    assert {tuple(uv) for uv in shots[:2]} == {(u + 2, v + 1), (far_u + 1, far_v + 1)}
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -135,3 +137,22 @@ def test_bad_input_is_one_sentence_and_no_zero(words, sentence, capsys):
     said = capsys.readouterr().err
     assert sentence in said
     assert "Traceback" not in said
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of files are POSIX's")
+def test_epochs_that_cannot_be_written_are_an_error_and_leave_nothing(tmp_path: Path):
+    """Beyond the limit every write fails, as on a full disk."""
+    rrd = tmp_path / "out.rrd"
+    program = f"""
+import resource, signal
+from selective_depth.app import cli, figures
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+figures.EPOCHS, figures.FIRST_POINTS, figures.FIRST_NODES = (1, 2), 500, 100
+words = ["epochs", {OBJECT!r}, "--out", {str(tmp_path / "out.webp")!r}, "--save", {str(rrd)!r}]
+raise SystemExit(cli.run(words))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 1, done.stderr
+    assert f"writing '{rrd}' failed. Check the disk" in done.stderr
+    assert not rrd.exists()

@@ -114,6 +114,18 @@ def test_score_does_not_change_with_the_unit_of_depth(depth, factor):
     np.testing.assert_array_equal(here.known, there.known)
 
 
+@pytest.mark.parametrize("holes", [0.0, 0.4])
+def test_score_is_one_half_where_a_share_of_the_measured_depth_is_gained(holes):
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(800, 4000, SHAPE).astype(np.float32)
+    depth[rng.random(SHAPE) < holes] = 0
+    seeds = SeedGrid.from_array(depth, LATTICE)
+    found = ImprovementSelector().select(seeds)
+    half = 5e-4 * seeds.depth_mm[seeds.valid].mean()
+    expected = np.where(found.known, found.raw / (found.raw + half), 0)
+    np.testing.assert_allclose(found.score, expected, rtol=1e-5)
+
+
 @pytest.mark.parametrize("depth_mm", [400, 1234, 10_000])
 def test_constant_depth_improves_nowhere(depth_mm):
     found = selected(np.full(SHAPE, depth_mm, np.float32))
