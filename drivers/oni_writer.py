@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Final, Self
@@ -54,7 +54,8 @@ class RecordWriter:
     """Writes the nodes and frames of an .oni file, and at the end all that points to them.
 
     Until `close`, the file looks like one whose recorder was killed: OpenNI2 and `inspect_oni`
-    read what is there.
+    read what is there. If it cannot be written to its end, it is removed: what it was to hold is
+    still where it came from, and the next attempt shall not find it in its way.
 
     Parameters
     ----------
@@ -69,8 +70,14 @@ class RecordWriter:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with self._saying():
+        try:
             self._file: BinaryIO = path.open("xb")
+        except FileExistsError:
+            raise OutputError(
+                f"'{path}' exists already; give another name, or remove it."
+            ) from None
+        except OSError as error:
+            raise self._failed(error) from error
         self._offset = 0
         self._nodes: dict[int, NodeAddition] = {}
         self._node_offsets: dict[int, int] = {}
@@ -112,15 +119,15 @@ class RecordWriter:
         if self._file.closed:
             return
         with self._saying():
-            try:
-                self._finish()
-            finally:
-                self._file.close()
+            self._finish()
+            self._file.flush()
+        self._file.close()
 
     def discard(self) -> None:
         """Close and remove the file."""
         if not self._file.closed:
-            self._file.close()
+            with suppress(OSError):
+                self._file.close()
             self.path.unlink(missing_ok=True)
 
     def _finish(self) -> None:
@@ -160,15 +167,15 @@ class RecordWriter:
     def _saying(self) -> Iterator[None]:
         try:
             yield
-        except FileExistsError:
-            raise OutputError(
-                f"'{self.path}' exists already; give another name, or remove it."
-            ) from None
         except OSError as error:
-            raise OutputError(
-                f"'{self.path}' cannot be written ({error.strerror}); check the folder, its"
-                " permissions and the free space."
-            ) from error
+            self.discard()
+            raise self._failed(error) from error
+
+    def _failed(self, error: OSError) -> OutputError:
+        return OutputError(
+            f"'{self.path}' cannot be written ({error.strerror}); check the folder, its permissions"
+            " and the free space."
+        )
 
 
 class OniWriter:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import struct
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -239,6 +240,28 @@ def test_an_existing_file_is_never_overwritten(recording: Path) -> None:
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"out\.oni' cannot be written \(No such file"):
         OniWriter(tmp_path / "missing" / "out.oni")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of files are POSIX's")
+@pytest.mark.parametrize("size", [10, 5_000, 150_000, -1])
+def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path, size: int) -> None:
+    """At whichever byte it is full, be it the last; a limit of the file's size does the same."""
+    import resource
+
+    frames = _frames(60)
+    whole = tmp_path / "whole.oni"
+    write_oni(whole, frames)
+    size = size % whole.stat().st_size
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        for write in (write_oni, lambda path, _: repair_oni(whole, path)):
+            with pytest.raises(OutputError, match=r"out\.oni' cannot be written \(File too large"):
+                write(tmp_path / "out.oni", frames)
+            assert list(tmp_path.iterdir()) == [whole]
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert write_oni(tmp_path / "out.oni", frames) == len(frames)
 
 
 def test_frames_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
