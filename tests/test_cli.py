@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import random
 import re
@@ -298,12 +299,17 @@ def test_unwritable_output(place: str, capsys: pytest.CaptureFixture[str], tmp_p
     assert "cannot be written" in line
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full is Linux's")
-def test_a_full_disk_is_said_to_be_full(capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["evaluate", "virtual:ball?size=64x48&frames=1", "--jobs", "1"]
-    command += ["--seeds.rows", "16", "--seeds.columns", "16", "--budget", "0.05"]
-    _, line = refuse(capsys, *command, "--json", "/dev/full")
-    assert "No space left on device. Make room there" in line
+def test_a_full_disk_is_said_to_be_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(path: Path, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    source = "virtual:ball?size=64x48&frames=1"
+    small = ["--seeds.rows", "16", "--seeds.columns", "16"]
+    _, line = refuse(capsys, "model", source, str(tmp_path), *small)
+    assert "cloud.ply' cannot be written: No space left on device. Make room there" in line
 
 
 @pytest.mark.parametrize(

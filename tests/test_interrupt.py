@@ -63,9 +63,12 @@ def run(program: str, meanwhile: Callable[[subprocess.Popen[str]], None]) -> tup
 
 STUBBORN = """
 import time
-print("ready", flush=True)
+word = "ready"
 while True:
     try:
+        if word:
+            print(word, flush=True)
+        word = ""
         time.sleep(60)
     except KeyboardInterrupt:
         pass

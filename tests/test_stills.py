@@ -124,7 +124,7 @@ def test_a_frame_beyond_the_end_is_named(tmp_path: Path) -> None:
 
 def test_an_unwritable_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
-    with pytest.raises(OutputError, match="--out"):
+    with pytest.raises(OutputError, match="file' cannot be written: File exists"):
         snapshot(["virtual:ball?size=320x240&frames=1"], 0, tmp_path / "file", SMALL)
 
 
