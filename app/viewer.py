@@ -40,7 +40,7 @@ DEPTH_COLOURS = legend.palette(cv2.COLORMAP_VIRIDIS)
 LOAD_S = 5.0
 """How long a viewer may show nothing while it is loading nothing."""
 PAINT_S = 30.0
-"""How long it may take to paint it."""
+"""How long it may take to paint what it has loaded."""
 WRITE_S = 3.0
 """A file that has not grown for so long while it should has failed."""
 SMALL_BYTES = 256 << 10
@@ -646,14 +646,12 @@ def _load(client: ViewerClient, recording: Path, frame: int | None) -> None:
         time.sleep(0.1)
     if frame is None:
         return
-    spans = [(each.start, each.end) for each in shown[0].timelines if each.name == "frame"]
-    for first, last in spans:
-        if first is None or last is None or not first <= frame <= last:
-            raise UsageError(
-                f"--frame is {frame}; the frames of '{recording}' are {first}..{last}."
-            )
-    if not spans:
+    spans = {each.name: (each.start, each.end) for each in shown[0].timelines}
+    first, last = spans.get("frame", (None, None))
+    if first is None or last is None:
         raise UsageError(f"--frame is {frame}, but '{recording}' has no frames, only other times.")
+    if not first <= frame <= last:
+        raise UsageError(f"--frame is {frame}; the frames of '{recording}' are {first}..{last}.")
     client.set_time("frame", sequence=frame, play_state="paused")  # else it plays on to the end
 
 

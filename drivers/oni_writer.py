@@ -118,10 +118,12 @@ class RecordWriter:
         """Finish the file. Harmless when called twice."""
         if self._file.closed:
             return
-        with self._saying():
-            self._finish()
-            self._file.flush()
-        self._file.close()
+        try:
+            with self._saying():
+                self._finish()
+                self._file.flush()
+        finally:
+            self._file.close()
 
     def discard(self) -> None:
         """Close and remove the file."""

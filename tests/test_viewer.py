@@ -497,6 +497,16 @@ def test_window_is_opened_and_used(monkeypatch: pytest.MonkeyPatch, listener: Li
     assert opened == [listener.port]
 
 
+def picture_of(recording: Path, frame: int | None = None) -> np.ndarray:
+    """A screenshot; no other trouble than a missing graphics driver is a reason to skip."""
+    try:
+        return viewer.screenshot(recording, frame)
+    except ViewerError as error:
+        if "does not start" in str(error):
+            pytest.skip(f"no graphics driver: {error}")
+        raise
+
+
 def test_a_picture_shows_the_frame_that_was_asked_for(tmp_path: Path) -> None:
     steps = []
     for index, far in enumerate((1000, 3000, 3000)):
@@ -506,10 +516,7 @@ def test_a_picture_shows_the_frame_that_was_asked_for(tmp_path: Path) -> None:
         steps.append(dataclasses.replace(made, frame=frame))
     recording = tmp_path / "out.rrd"
     save(recording, steps, near_mm=1000, far_mm=3000)
-    try:
-        last, first = viewer.screenshot(recording), viewer.screenshot(recording, 0)
-    except ViewerError as error:
-        pytest.skip(f"no graphics driver: {error}")
+    last, first = picture_of(recording), picture_of(recording, 0)
     for picture, level in ((last, 255), (first, 0)):
         view = picture[60:380, :540].reshape(-1, 3).astype(int)
         blue, green, red = (
@@ -525,8 +532,8 @@ def test_a_picture_of_a_recording_that_holds_nothing_is_refused(tmp_path: Path) 
     save(tmp_path / "out.rrd", [make_step(0)])
     data = (tmp_path / "out.rrd").read_bytes()
     (tmp_path / "cut.rrd").write_bytes(data[:1000])
-    with pytest.raises(ViewerError, match=r"finds nothing to show|does not start"):
-        viewer.screenshot(tmp_path / "cut.rrd")
+    with pytest.raises(ViewerError, match="finds nothing to show"):
+        picture_of(tmp_path / "cut.rrd")
 
 
 class SlowPage(http.server.BaseHTTPRequestHandler):
