@@ -6,12 +6,14 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 
+from selective_depth.app.errors import UsageError
 from selective_depth.app.precompile import compiling_beside
 from selective_depth.app.settings import Settings
 from selective_depth.app.step import Arrival, Model, Step
@@ -26,6 +28,15 @@ from selective_depth.selectors.seeds import SeedGrid
 MODEL_EVERY = 10
 """Of a sensor's frames, one in so many gets a dense model: at 30 frames/s, one of every frame
 would take most of a core, which the frames themselves need."""
+
+
+@contextmanager
+def _as_options(section: str) -> Iterator[None]:
+    """Name the option where a selector names its parameter: they are called the same."""
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(f"--{section}.{error}.") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +84,7 @@ class Loop:
 
     Raises
     ------
-    ValueError
+    UsageError
         If an option of a selector is out of its range.
     """
 
@@ -85,18 +96,20 @@ class Loop:
         self.times = StageTimes()
         self._settings = settings
         self._live_gas = gas.training == "live"
-        self._gas = NeuralGasSelector(
-            nodes=gas.nodes,
-            epochs=gas.epochs,
-            algorithm=gas.algorithm,
-            seed=gas.seed,
-            edge_metric=gas.edge_metric,
-            factor=gas.factor,
-            threads=threads,
-        )
-        self._improvement = ImprovementSelector(
-            share=improvement.share, exponent=improvement.exponent, threads=threads
-        )
+        with _as_options("gas"):
+            self._gas = NeuralGasSelector(
+                nodes=gas.nodes,
+                epochs=gas.epochs,
+                algorithm=gas.algorithm,
+                seed=gas.seed,
+                edge_metric=gas.edge_metric,
+                factor=gas.factor,
+                threads=threads,
+            )
+        with _as_options("improvement"):
+            self._improvement = ImprovementSelector(
+                share=improvement.share, exponent=improvement.exponent, threads=threads
+            )
         self._realtime = realtime
         # The stages are compiled and free of the GIL: side by side they take as long as the
         # longest of them.

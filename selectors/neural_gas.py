@@ -78,6 +78,8 @@ class NeuralGasSelector:
             raise ValueError(f"epochs is {epochs}; give at least 1, the paper's best is 40 to 60")
         if algorithm not in ("exact", "fast"):
             raise ValueError(f"algorithm is {algorithm!r}; give 'exact' or 'fast'")
+        if seed < 0:
+            raise ValueError(f"seed is {seed}; give 0 or more")
         if edge_metric not in ("3d", "image"):
             raise ValueError(f"edge_metric is {edge_metric!r}; give '3d' or 'image'")
         if not factor > 0:

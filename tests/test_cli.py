@@ -144,6 +144,8 @@ def test_completion_knows_the_commands(shell: str, capsys: pytest.CaptureFixture
         (["replay", "x", "--budget", "2"], "--budget is 2.0; it must be a share between 0 and 1"),
         (["replay", "x", "--rounds", "0"], "--rounds is 0"),
         (["replay", "x", "--rounds", "255"], "--rounds is 255; it must be from 1 to 254"),
+        (["replay", "virtual:ball", "--headless", "--gas.seed", "-1"], "--gas.seed is -1; give 0"),
+        (["snapshot", "virtual:ball", "--improvement.share", "2"], "--improvement.share is 2.0"),
         (["replay", "x", "--serve-memory", "much"], "--serve-memory is 'much'"),
         (["snapshot"], "no source was named"),
         (["evaluate"], "no source was named"),

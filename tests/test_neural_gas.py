@@ -309,6 +309,47 @@ def test_reheats_on_a_cut_and_not_on_the_way(shared_data):
     assert gas.update(seeds.points_mm, seeds.uv).reheated_
 
 
+def test_only_a_jump_of_the_error_takes_the_passes_of_a_cold_training():
+    points = scene(300)
+    points[:, 2] = 1e4 * np.arange(300)  # each has one near node, its own
+    uv = (points[:, :2] / 5 + 200).astype(np.int32)
+    for jump, changed in ((1.9, False), (2.1, True)):
+        gas = BatchNeuralGas(300, seed=0).adopt(points.copy(), uv.astype(np.float32), points)
+        gas.quantisation_error_mm_ = 10.0  # as if these had been the nodes of a coarse training
+        aside = np.float32([jump * 10, 0, 0])
+        assert gas.update(points + aside, uv).reheated_ == changed
+    assert not gas.train(points, uv).reheated_
+
+
+def test_a_training_does_not_depend_on_where_in_the_image_its_seeds_lie():
+    points = scene(2000)
+    uv = (points[:, :2] / 5 + 200).astype(np.int32)
+    offset = np.array([1300, -700], np.int32)
+    here, there = (BatchNeuralGas(200, seed=0) for _ in range(2))
+    here.train(points, uv)
+    there.train(points, uv + offset)
+    for _ in range(2):
+        assert np.allclose(here.nodes_mm_, there.nodes_mm_, atol=1e-2)
+        assert np.allclose(here.nodes_uv_ + offset, there.nodes_uv_, atol=1e-2)
+        here.update(points, uv)
+        there.update(points, uv + offset)
+
+
+def test_adopted_nodes_are_taken_as_they_are():
+    points = scene(500)
+    uv = (points[:, :2] / 5 + 200).astype(np.int32)
+    nodes_mm, nodes_uv = points[::7].copy(), uv[::7].astype(np.float32)
+    gas = BatchNeuralGas(len(nodes_mm), seed=0).train(points, uv)
+    gas.adopt(nodes_mm, nodes_uv, points)
+    apart = np.linalg.norm(points[:, None] - nodes_mm[None], axis=2)
+    assert gas.quantisation_error_mm_ == pytest.approx(apart.min(axis=1).mean(), rel=1e-5)
+    assert gas.won_.all()
+    assert not gas.reheated_
+    before = nodes_uv.copy()
+    gas.update(points, uv)
+    assert np.array_equal(nodes_uv, before)  # whoever trained them keeps theirs
+
+
 def test_update_outlives_an_empty_frame_and_a_nearly_empty_one():
     camera = Camera.kinect(160, 120)
     full = np.full((120, 160), 1500, np.uint16)
@@ -431,6 +472,7 @@ def test_nan_is_refused_with_a_sentence(algorithm):
         ({"nodes": 0}, "nodes is 0; give at least 1"),
         ({"epochs": 0}, "epochs is 0; give at least 1"),
         ({"algorithm": "quick"}, "give 'exact' or 'fast'"),
+        ({"seed": -1}, "seed is -1; give 0 or more"),
         ({"edge_metric": "4d"}, "give '3d' or 'image'"),
         ({"factor": 0.0}, "must be positive"),
         ({"factor": float("nan")}, "must be positive"),
