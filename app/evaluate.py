@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.app import interrupt
 from selective_depth.app.errors import UsageError
 from selective_depth.app.strategies import STRATEGIES, Case
 from selective_depth.drivers.frame import DepthFrame
@@ -265,7 +266,8 @@ def _spread(
     done = False
     try:
         for number, frame in chosen:
-            with _started_deaf_to_ctrl_c():
+            # A worker whose start is cut short reports that nobody told it what to do.
+            with interrupt.deferred(), _started_deaf_to_ctrl_c():
                 under_way[pool.submit(_evaluate_frame, frame, *arguments)] = number
             if len(under_way) == 2 * jobs:
                 settle()

@@ -381,6 +381,40 @@ def test_an_interrupted_evaluation_leaves_no_process(tmp_path: Path) -> None:
         time.sleep(0.05)
 
 
+INTERRUPTED_STARTING = """
+import os, signal, sys, time
+from multiprocessing import util
+from selective_depth.app import cli
+
+start = util.spawnv_passfds
+
+def interrupted(path, arguments, handles):
+    number = start(path, arguments, handles)
+    if "--multiprocessing-fork" in arguments:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(1.0)
+    return number
+
+util.spawnv_passfds = interrupted
+cli.main()
+"""
+
+
+def test_a_worker_that_is_just_being_started_ends_without_a_word(tmp_path: Path) -> None:
+    arguments = ["evaluate", "virtual:ball?frames=30", "--every", "1"]
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_STARTING, *arguments],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=30,
+    )
+    assert done.returncode == 130
+    assert [line for line in done.stderr.splitlines() if "frames" not in line] == [
+        "selective-depth: interrupted."
+    ]
+
+
 def test_nobody_at_the_viewers_address(capsys: pytest.CaptureFixture[str]) -> None:
     _, line = refuse(
         capsys, "replay", ENDLESS, *QUICK, "--connect", "rerun+http://127.0.0.1:9/proxy"
