@@ -9,7 +9,7 @@ import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 from tyro.conf import arg
 
@@ -596,15 +596,3 @@ def _sentence(error: Exception) -> str:
 
 def _say(words: str) -> None:
     print(f"{PROGRAM}: {words}", file=sys.stderr)
-
-
-def main() -> NoReturn:
-    """Entry point of the console script."""
-    interrupt.install()
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed by whoever started this
-            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 - for good
-    code = run(sys.argv[1:])
-    if code == INTERRUPTED:
-        interrupt.leave()
-    sys.exit(code)

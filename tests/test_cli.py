@@ -384,7 +384,7 @@ def test_an_interrupted_evaluation_leaves_no_process(tmp_path: Path) -> None:
 INTERRUPTED_STARTING = """
 import os, signal, sys, time
 from multiprocessing import util
-from selective_depth.app import cli
+from selective_depth.app.__main__ import main
 
 start = util.spawnv_passfds
 
@@ -396,7 +396,7 @@ def interrupted(path, arguments, handles):
     return number
 
 util.spawnv_passfds = interrupted
-cli.main()
+main()
 """
 
 
@@ -413,6 +413,19 @@ def test_a_worker_that_is_just_being_started_ends_without_a_word(tmp_path: Path)
     assert [line for line in done.stderr.splitlines() if "frames" not in line] == [
         "selective-depth: interrupted."
     ]
+
+
+def test_interrupted_before_it_has_read_its_command_line() -> None:
+    program = (
+        "import os, signal, sys; from selective_depth.app.__main__ import main;"
+        "find = type('', (), {'find_spec': staticmethod(lambda name, *_:"
+        " os.kill(os.getpid(), signal.SIGINT) if name == 'tyro' else None)});"
+        "sys.meta_path.insert(0, find); main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, "devices"], capture_output=True, text=True, timeout=30
+    )
+    assert (done.returncode, done.stderr) == (130, "selective-depth: interrupted.\n")
 
 
 def test_nobody_at_the_viewers_address(capsys: pytest.CaptureFixture[str]) -> None:
