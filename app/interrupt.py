@@ -2,16 +2,19 @@
 
 Python raises KeyboardInterrupt wherever it happens to be, and loses it where nothing may be
 raised: in a callback of an import, in a destructor; in a call of a compiled function it becomes a
-SystemError. So it is noted as well, for the loop to look at and for errors to be known by; and if
-all else fails, a watchdog ends the program.
+SystemError. So it is noted as well, for the loop to look at and for errors to be known by. In a
+call of anything that is not Python it waits until that returns; so, if all else fails, a watchdog
+ends the program.
 """
 
 from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
@@ -31,6 +34,10 @@ def install() -> None:
     """Take Ctrl-C and the system's request to end, which is treated alike."""
     signal.signal(signal.SIGINT, _on_signal)
     signal.signal(signal.SIGTERM, _on_signal)
+    told, tells = socket.socketpair()
+    tells.setblocking(False)
+    signal.set_wakeup_fd(tells.detach(), warn_on_full_buffer=False)
+    threading.Thread(target=_watch, args=(told,), name="watchdog", daemon=True).start()
     # It may come where Python can only report that it was raised and lost; `check` raises it again.
     sys.unraisablehook = _unless_interrupted
     # `leave` lets no destructor run. What processes shared is then cleared away by Python's
@@ -88,11 +95,18 @@ def _unless_interrupted(lost: sys.UnraisableHookArgs) -> None:
         sys.__unraisablehook__(lost)
 
 
+def _watch(told: socket.socket) -> None:
+    """End the program when it has had its time.
+
+    The system tells a socket of a signal at once, `_on_signal` only when Python is running again.
+    """
+    while told.recv(1)[0] not in (signal.SIGINT, signal.SIGTERM):
+        pass
+    time.sleep(_patience_s)
+    os._exit(EXIT_CODE)
+
+
 def _on_signal(number: int, frame: object) -> None:
-    if not _asked.is_set():
-        _asked.set()
-        watchdog = threading.Timer(_patience_s, os._exit, (EXIT_CODE,))
-        watchdog.daemon = True
-        watchdog.start()
+    _asked.set()
     if not _deferring:
         raise KeyboardInterrupt

@@ -75,11 +75,26 @@ while True:
 """
 
 
+NOT_PYTHON = """
+import hashlib
+print("ready", flush=True)
+hashlib.pbkdf2_hmac("sha256", b"", b"", 100_000_000)  # takes a minute and looks at no signal
+"""
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="signals between processes are POSIX's")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_what_ignores_ctrl_c_is_ended_by_the_watchdog(number: signal.Signals) -> None:
+@pytest.mark.parametrize(
+    ("program", "number"), [(STUBBORN, signal.SIGINT), (NOT_PYTHON, signal.SIGTERM)]
+)
+def test_what_ignores_ctrl_c_is_ended_by_the_watchdog(
+    program: str, number: signal.Signals
+) -> None:
+    def interrupt_it(process: subprocess.Popen[str]) -> None:
+        time.sleep(0.5)  # it has said that it is ready, and goes on to its call
+        process.send_signal(number)
+
     start_s = time.monotonic()
-    code, _, _ = run(STUBBORN, lambda process: process.send_signal(number))
+    code, _, _ = run(program, interrupt_it)
     assert code == 130
     assert time.monotonic() - start_s < interrupt.LEAVE_S + 2
 
