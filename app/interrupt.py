@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import NoReturn
 
 EXIT_CODE = 130
 LEAVE_S = 2.8
@@ -34,14 +32,16 @@ def install() -> None:
     """Take Ctrl-C and the system's request to end, which is treated alike."""
     signal.signal(signal.SIGINT, _on_signal)
     signal.signal(signal.SIGTERM, _on_signal)
+    import socket  # it takes its time: Ctrl-C is taken already
+
     told, tells = socket.socketpair()
     tells.setblocking(False)
     signal.set_wakeup_fd(tells.detach(), warn_on_full_buffer=False)
-    threading.Thread(target=_watch, args=(told,), name="watchdog", daemon=True).start()
+    threading.Thread(target=_watch, args=(told.recv,), name="watchdog", daemon=True).start()
     # It may come where Python can only report that it was raised and lost; `check` raises it again.
     sys.unraisablehook = _unless_interrupted
-    # `leave` lets no destructor run. What processes shared is then cleared away by Python's
-    # tracker of such things, which need not warn of it.
+    # The program ends without its destructors. What processes shared is then cleared away by
+    # Python's tracker of such things, which need not warn of it.
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
 
 
@@ -67,17 +67,6 @@ def recognised() -> Iterator[None]:
         raise
 
 
-def leave() -> NoReturn:
-    """End at once, with all output said. Everything must be closed.
-
-    What an import or a compiler was in the middle of can neither hold this up nor change the
-    exit code, as it can with Python's own way out.
-    """
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(EXIT_CODE)
-
-
 @contextmanager
 def deferred() -> Iterator[None]:
     """Let what happens inside, which must leave nothing half done, end before Ctrl-C is raised."""
@@ -95,12 +84,12 @@ def _unless_interrupted(lost: sys.UnraisableHookArgs) -> None:
         sys.__unraisablehook__(lost)
 
 
-def _watch(told: socket.socket) -> None:
+def _watch(receive: Callable[[int], bytes]) -> None:
     """End the program when it has had its time.
 
     The system tells a socket of a signal at once, `_on_signal` only when Python is running again.
     """
-    while told.recv(1)[0] not in (signal.SIGINT, signal.SIGTERM):
+    while receive(1)[0] not in (signal.SIGINT, signal.SIGTERM):
         pass
     time.sleep(_patience_s)
     os._exit(EXIT_CODE)

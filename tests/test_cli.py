@@ -428,6 +428,26 @@ def test_interrupted_before_it_has_read_its_command_line() -> None:
     assert (done.returncode, done.stderr) == (130, "selective-depth: interrupted.\n")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no file size limit on Windows")
+def test_output_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    """Beyond the limit every write fails, as on a full disk."""
+    program = (
+        "import resource, signal; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0));"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
+        "from selective_depth.app.__main__ import main; main()"
+    )
+    with (tmp_path / "out.txt").open("w") as out:
+        done = subprocess.run(
+            [sys.executable, "-B", "-c", program, "--help"],
+            stdout=out,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONUNBUFFERED": ""},
+        )
+    assert done.returncode == 1
+    assert done.stderr == "selective-depth: the output cannot be written: File too large.\n"
+
+
 def test_nobody_at_the_viewers_address(capsys: pytest.CaptureFixture[str]) -> None:
     _, line = refuse(
         capsys, "replay", ENDLESS, *QUICK, "--connect", "rerun+http://127.0.0.1:9/proxy"

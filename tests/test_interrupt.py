@@ -86,9 +86,7 @@ hashlib.pbkdf2_hmac("sha256", b"", b"", 100_000_000)  # takes a minute and looks
 @pytest.mark.parametrize(
     ("program", "number"), [(STUBBORN, signal.SIGINT), (NOT_PYTHON, signal.SIGTERM)]
 )
-def test_what_ignores_ctrl_c_is_ended_by_the_watchdog(
-    program: str, number: signal.Signals
-) -> None:
+def test_what_ignores_ctrl_c_is_ended_by_the_watchdog(program: str, number: signal.Signals) -> None:
     def interrupt_it(process: subprocess.Popen[str]) -> None:
         time.sleep(0.5)  # it has said that it is ready, and goes on to its call
         process.send_signal(number)
@@ -133,12 +131,3 @@ except KeyboardInterrupt:
 """
     code, out, _ = run(program, lambda process: process.send_signal(signal.SIGINT))
     assert (code, out) == (0, "done\nraised\n")
-
-
-def test_leaving_says_all_that_was_to_be_said() -> None:
-    program = """
-print("ready", flush=True)
-print("the last word")
-interrupt.leave()
-"""
-    assert run(program, lambda process: None)[:2] == (130, "the last word\n")
