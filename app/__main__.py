@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
-from selective_depth.app import interrupt
+from selective_depth.app.console import interrupt
 
 
 def main() -> NoReturn:

@@ -13,8 +13,8 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from selective_depth.app import interrupt
-from selective_depth.app.command import (
+from selective_depth.app.console import interrupt
+from selective_depth.app.console.command import (
     PROGRAM,
     command,
     completion,
@@ -22,7 +22,7 @@ from selective_depth.app.command import (
     overview,
     settings_arguments,
 )
-from selective_depth.app.errors import AppError, UsageError
+from selective_depth.app.console.errors import AppError, UsageError
 from selective_depth.app.settings import (
     AcquireOptions,
     Flag,
@@ -70,8 +70,8 @@ def replay(source: SourceOrSample = None, /, settings: Options = DEFAULTS) -> in
     settings : Settings
         All options.
     """
-    from selective_depth.app.samples import bundled_recording
-    from selective_depth.app.session import watch
+    from selective_depth.app.commands.run import watch
+    from selective_depth.app.commands.samples import bundled_recording
 
     return watch(bundled_recording() if source is None else source, settings)
 
@@ -92,7 +92,7 @@ def live(device: Annotated[str, optional("DEVICE")] = "", /, settings: Options =
     settings : Settings
         All options.
     """
-    from selective_depth.app.session import watch
+    from selective_depth.app.commands.run import watch
 
     return watch(f"openni:{device}" if device else "openni", settings)
 
@@ -126,7 +126,7 @@ def record(
     overwrite : bool
         Replace a file of that name.
     """
-    from selective_depth.app.sensors import record_sensor
+    from selective_depth.app.commands.sensors import record_sensor
 
     return record_sensor(out, device, frames=frames, seconds=seconds, overwrite=overwrite)
 
@@ -134,7 +134,7 @@ def record(
 @command("Sensors", (f"{PROGRAM} devices", "what is plugged in, or what is missing"))
 def devices() -> int:
     """List the sensors that OpenNI2 finds, or say what is missing and what to install."""
-    from selective_depth.app.sensors import print_devices
+    from selective_depth.app.commands.sensors import print_devices
 
     return print_devices()
 
@@ -161,7 +161,7 @@ def check(
     timeout : float
         Look at it for so long at most.
     """
-    from selective_depth.app.files import check_file
+    from selective_depth.app.commands.files import check_file
 
     return check_file(file, repair=repair, timeout_s=timeout)
 
@@ -189,7 +189,7 @@ def export(
     frames : int
         Stop after this many frames.
     """
-    from selective_depth.app.files import export as save
+    from selective_depth.app.commands.files import export as save
 
     return save(source, out, frames)
 
@@ -224,8 +224,8 @@ def model(
     seeds
         The seed lattice.
     """
-    from selective_depth.app.export import save_model
-    from selective_depth.app.snapshot import nth_frame
+    from selective_depth.app.commands.model import save_model
+    from selective_depth.app.commands.snapshot import nth_frame
     from selective_depth.selectors.acquire import acquire
     from selective_depth.selectors.seeds import SeedGrid
 
@@ -258,10 +258,10 @@ def screenshot(
     frame : int
         The frame to show; by default the last.
     """
-    from selective_depth.app import viewer
-    from selective_depth.app.output import check_picture, write_picture
-    from selective_depth.app.progress import waiting
-    from selective_depth.app.report import say
+    from selective_depth.app.console.output import check_picture, write_picture
+    from selective_depth.app.console.progress import waiting
+    from selective_depth.app.pipeline import say
+    from selective_depth.app.viewer import recording as viewer
 
     check_picture(picture)
     with waiting("Loading it into the viewer"):
@@ -303,8 +303,8 @@ def snapshot(
     seeds, gas, improvement, acquire
         Options of the selectors.
     """
-    from selective_depth.app.progress import waiting
-    from selective_depth.app.snapshot import snapshot as make_stills
+    from selective_depth.app.commands.snapshot import snapshot as make_stills
+    from selective_depth.app.console.progress import waiting
 
     if frame < 0:
         raise UsageError(f"--frame is {frame}; frames count from 0.")
@@ -342,7 +342,7 @@ def epochs(
     seed : int
         Seed of the random draws.
     """
-    from selective_depth.app.figures import draw_epochs
+    from selective_depth.app.commands.figures import draw_epochs
 
     return draw_epochs(source, out, save=save, number=frame, seed=seed)
 
@@ -374,7 +374,7 @@ def densities(
     seed : int
         Seed of the random draws.
     """
-    from selective_depth.app.figures import draw_densities
+    from selective_depth.app.commands.figures import draw_densities
 
     return draw_densities(source, out, number=frame, epochs=epochs, seed=seed)
 
@@ -401,7 +401,7 @@ def nodes(
     out : Path
         Write the table as Markdown as well.
     """
-    from selective_depth.app.figures import tabulate_nodes
+    from selective_depth.app.commands.figures import tabulate_nodes
 
     return tabulate_nodes(source, every=every, out=out)
 
@@ -434,8 +434,8 @@ def bench(
     no_peers : bool
         Leave out the peers that are installed (pip install 'selective-depth[bench]').
     """
-    from selective_depth.app.bench_report import run_bench
-    from selective_depth.app.samples import bundled_recording
+    from selective_depth.app.benchmark.report import run_bench
+    from selective_depth.app.commands.samples import bundled_recording
 
     uri = bundled_recording() if source is None else source
     run_bench(uri, frames, json=json, page=page, peers=not no_peers)
@@ -492,7 +492,7 @@ def evaluate(
     picture : Path
         Write where each strategy shot and how wrong its model is, for the first frame.
     """
-    from selective_depth.app.evaluate_report import run_evaluation
+    from selective_depth.app.evaluation.report import run_evaluation
 
     run_evaluation(
         sources,
@@ -572,8 +572,8 @@ def _take(words: list[str], *names: str) -> bool:
 def _versions() -> str:
     from importlib.metadata import version
 
+    from selective_depth.drivers.errors import SourceError
     from selective_depth.drivers.openni import runtime_version
-    from selective_depth.drivers.source import SourceError
 
     try:
         runtime = f"OpenNI2 runtime {runtime_version()}"
@@ -583,7 +583,7 @@ def _versions() -> str:
 
 
 def _sentence(error: Exception) -> str:
-    from selective_depth.drivers.source import SourceError
+    from selective_depth.drivers.errors import SourceError
 
     words = " ".join(str(error).split())
     if isinstance(error, (AppError, SourceError, ValueError, OSError)) and words:

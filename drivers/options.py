@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from selective_depth.drivers.source import SourceNotFoundError
+from selective_depth.drivers.errors import SourceNotFoundError
 
 SMALLEST, LARGEST = 16, 4096
 """Bounds of a frame's width and height in pixels that `Options.size` accepts."""

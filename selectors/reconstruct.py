@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from selective_depth.selectors.delaunay import Mesh
 from selective_depth.selectors.parallel import in_bands
+from selective_depth.selectors.triangulation import Mesh
 
 STEP_MM = 50.0
 """Depth span of a triangle's vertices above which it may be a bridge, millimetres."""

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from virtual_sensor import record_oni
 
-from selective_depth.drivers.recorded import write_folder
-from selective_depth.drivers.source import open_source
+from selective_depth.drivers.folder import write_folder
+from selective_depth.drivers.open import open_source
 
 RECORDINGS = Path(__file__).parent.parent / "recordings"
 ORIGINAL = "virtual:workstation?frames=30&speed=2&seed=7"

@@ -10,12 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import numpy.typing as npt
-from test_virtual import plane_residuals
+from kinect_residuals import plane_residuals
 
-from selective_depth.app.output import write_picture
-from selective_depth.app.stills import GAP, Panel, depth_panel, finished
-from selective_depth.drivers.source import open_source
-from selective_depth.drivers.virtual_scenes import SCENES
+from selective_depth.app.console.output import write_picture
+from selective_depth.app.pictures.stills import GAP, Panel, depth_panel, finished
+from selective_depth.drivers.open import open_source
+from selective_depth.drivers.virtual.scenes import SCENES
 
 ROOT = Path(__file__).parent.parent
 PICTURE = ROOT / "app" / "docs" / "pictures" / "virtual-kinect.png"

@@ -1,0 +1,1 @@
+"""Every stage timed, and the same work done elsewhere timed beside it."""

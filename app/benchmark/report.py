@@ -1,0 +1,108 @@
+"""The figures of `bench` for people: tables on the terminal, and the benchmark page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from selective_depth.app.benchmark.bench import BenchReport, bench, ratios
+from selective_depth.app.console.output import check_output, write_output
+from selective_depth.app.pipeline import say
+
+PAGE = """# Benchmark
+
+Made by `selective-depth bench {report.source} --page benchmark.md`; every figure is of one run.
+{host}.
+
+The whole loop, both selectors with the live neural gas, saving for Rerun, on {report.source}
+played in real time: **{report.fps:.1f} frames/s over {report.frames} frames, {report.dropped}
+dropped**, {report.threads} kernel threads.
+
+| stage | p50 ms | p99 ms | max ms | runs |
+|---|---:|---:|---:|---:|
+{stages}
+
+`improvement` is the whole map with estimate and variance, holes and borders included;
+`neural_gas_exact` and `neural_gas_fast` train 2,800 nodes from nothing (exact: 50 epochs of
+eq. (1)-(4)); `neural_gas_live` goes on from the last frame; `regions` is Delaunay and both masks;
+`log` is what the viewer's thread spends on a frame beside the loop; `loop` is the whole turn.
+
+The same work in other libraries, timed in the same run:
+
+| peer | its time | our stage | times slower |
+|---|---:|---|---:|
+{peers}
+
+`krigekit_ordinary_kriging` (Fortran, all threads) and `pykrige_ordinary_kriging` krig every pixel
+of the first frame from its 16 nearest seeds, estimate and variance only; PyKrige's time is extended
+from two samples of the pixels. `numpy_neural_gas` is a plain NumPy loop of eq. (1)-(4), extended
+from 3,000 steps to 50 epochs.
+
+How exact the timed code is: the map against eq. (13) in float64 in
+[improvement.md](improvement.md), the trainings against a plain float64 loop and against each
+other in [neural-gas.md](neural-gas.md). Times vary from run to run on a shared machine; the
+ratios vary less.
+"""
+
+
+def run_bench(
+    source: str, frames: int | None, *, json: Path | None, page: Path | None, peers: bool
+) -> None:
+    """Measure, print the tables, and write the files that were asked for.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    check_output(json, page)
+    report = bench(source, frames, peers=peers, say=lambda text: say(f"timing: {text} …"))
+    print_bench(report)
+    for path, text in ((json, report.to_json), (page, lambda: to_page(report))):
+        if path is not None:
+            write_output(path, text())
+            say(f"wrote {path}")
+
+
+def print_bench(report: BenchReport) -> None:
+    """Print stages, peers and ratios as tables."""
+    console = Console(highlight=False)
+    console.print(
+        f"\n{report.source}: {report.frames} frames in real time at {report.fps:.1f} frames/s,"
+        f" {report.dropped} dropped, {report.threads} threads",
+        soft_wrap=True,
+    )
+    stages = Table(box=None, pad_edge=False)
+    for heading in ("milliseconds", "p50", "p99", "max", "runs"):
+        stages.add_column(heading, justify="left" if heading == "milliseconds" else "right")
+    for name, each in report.stages.items():
+        figures = (each.p50_ms, each.p99_ms, each.max_ms)
+        stages.add_row(name, *(f"{figure:,.2f}" for figure in figures), f"{each.count:,}")
+    console.print(stages)
+    if report.peers:
+        others = Table(box=None, pad_edge=False)
+        others.add_column("\nthe same work elsewhere")
+        others.add_column("seconds", justify="right", vertical="bottom")
+        others.add_column("", justify="right")
+        for pair, ratio in ratios(report).items():
+            peer = pair.partition(" / ")[0]
+            others.add_row(pair, f"{report.peers[peer]:,.2f}", f"{ratio:,.0f} times")
+        console.print(others)
+
+
+def to_page(report: BenchReport) -> str:
+    """The benchmark page of the documentation, in Markdown."""
+    stages = "\n".join(
+        f"| `{name}` | {each.p50_ms:,.2f} | {each.p99_ms:,.2f} | {each.max_ms:,.2f} |"
+        f" {each.count:,} |"
+        for name, each in report.stages.items()
+    )
+    peers = "\n".join(
+        f"| `{pair.partition(' / ')[0]}` | {report.peers[pair.partition(' / ')[0]]:,.2f} s |"
+        f" `{pair.partition(' / ')[2]}` | {ratio:,.0f} |"
+        for pair, ratio in ratios(report).items()
+    )
+    host = ", ".join(f"{name} {value}" for name, value in report.machine.items())
+    return PAGE.format(report=report, stages=stages, peers=peers, host=host)

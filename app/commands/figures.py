@@ -1,0 +1,438 @@
+"""The neural gas figures of the paper (Fig. 1 and 2), and the table behind the defaults."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from selective_depth.app.commands.snapshot import nth_frame
+from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.output import check_picture, write_output, write_picture
+from selective_depth.app.console.progress import waiting
+from selective_depth.app.pictures.stills import (
+    GAP,
+    INK,
+    NODE,
+    PALE,
+    PAPER,
+    Image,
+    text_width,
+    write_text,
+)
+from selective_depth.app.pipeline import say
+from selective_depth.drivers.errors import OutputError
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.open import open_source
+from selective_depth.selectors.neural_gas import (
+    EdgeMetric,
+    NeuralGasSelector,
+    RegionSelection,
+    delaunay_regions,
+)
+from selective_depth.selectors.reconstruct import reconstruct
+from selective_depth.selectors.seeds import SeedGrid
+
+EPOCHS = (5, 10, 25, 40, 60, 100)
+"""Training lengths of Fig. 1."""
+FIRST_POINTS, FIRST_NODES = 4200, 45 * 50
+"""Size of the first scan and of the map of Fig. 1."""
+DENSITIES = (32, 40, 64, 75)
+"""Sides of the first scans of Fig. 2."""
+METRICS: tuple[EdgeMetric, EdgeMetric] = ("3d", "image")
+TABLE_NODES = (700, 1400, 2800, 5600)
+TABLE_EPOCHS = (5, 10, 20, 50, 100)
+
+_NAMES = {"3d": "short in space", "image": "short in the image"}
+_PANEL_WIDTH = 215
+_AREA = (92, 64, 34)
+_OBJECT = np.array((222, 219, 216), dtype=np.uint8)
+
+
+def object_seeds(frame: DepthFrame, points: int) -> SeedGrid:
+    """Take a lattice of which about `points` seeds hit the object.
+
+    The paper's first scans are of the object alone: their 64x64 are 4,200 points on the bunny.
+    A lattice over the frame has to be finer, by the share of the frame that the object fills.
+
+    Parameters
+    ----------
+    frame : DepthFrame
+        The object before nothing.
+    points : int
+        How many seeds shall hit it.
+    """
+    height, width = frame.shape
+    spacing = np.sqrt(np.count_nonzero(frame.depth_mm) / points)
+    rows, columns = (
+        int(np.clip(round(side / max(spacing, 1)), 1, side)) for side in (height, width)
+    )
+    return SeedGrid.from_frame(frame, (rows, columns))
+
+
+def epoch_selections(
+    seeds: SeedGrid,
+    epochs: Sequence[int] = EPOCHS,
+    nodes: int = FIRST_NODES,
+    seed: int = 0,
+) -> Iterator[tuple[int, dict[EdgeMetric, RegionSelection]]]:
+    """Train by the published steps for several lengths; yield the regions of each as it is done.
+
+    Each length is a training of its own, as in Fig. 1: the annealing of eq. (4) ends with it.
+
+    Parameters
+    ----------
+    seeds : SeedGrid
+        The first scan.
+    epochs : sequence of int, default 5, 10, 25, 40, 60, 100
+        Training lengths.
+    nodes : int, default 2250
+        Number of nodes.
+    seed : int, default 0
+        Seed of the random draws.
+
+    Yields
+    ------
+    int
+        The training length.
+    dict
+        The regions by each edge metric, from the same nodes.
+    """
+    for length in epochs:
+        yield length, by_metric(NeuralGasSelector(nodes, length, "exact", seed).select(seeds))
+
+
+def by_metric(selection: RegionSelection) -> dict[EdgeMetric, RegionSelection]:
+    """Regions of one set of nodes by both edge metrics."""
+    return {
+        metric: delaunay_regions(
+            selection.nodes_mm,
+            selection.nodes_uv,
+            selection.mask.shape,
+            edge_metric=metric,
+            quantisation_error_mm=selection.quantisation_error_mm,
+        )
+        for metric in METRICS
+    }
+
+
+def epochs_figure(
+    frame: DepthFrame,
+    seeds: SeedGrid,
+    trained: Sequence[tuple[int, dict[EdgeMetric, RegionSelection]]],
+) -> Image:
+    """Fig. 1 of the paper: nodes and areas of interest after trainings of several lengths.
+
+    Parameters
+    ----------
+    frame : DepthFrame
+        The object.
+    seeds : SeedGrid
+        Its first scan.
+    trained : sequence
+        What `epoch_selections` yielded.
+
+    Returns
+    -------
+    uint8 array of shape (height, width, 3)
+        Blue-green-red.
+    """
+    columns = [
+        (f"{length} epochs", f"error {chosen['3d'].quantisation_error_mm:.1f} mm", chosen)
+        for length, chosen in trained
+    ]
+    nodes = len(trained[0][1]["3d"].nodes_mm)
+    return _figure(frame, f"{len(seeds.uv):,} points, {nodes:,} nodes", columns)
+
+
+def densities_figure(
+    frame: DepthFrame,
+    sides: Sequence[int] = DENSITIES,
+    epochs: int = 50,
+    seed: int = 0,
+) -> Image:
+    """Fig. 2 of the paper: areas of interest from first scans of several densities.
+
+    Parameters
+    ----------
+    frame : DepthFrame
+        The object.
+    sides : sequence of int, default 32, 40, 64, 75
+        About side * side seeds hit the object.
+    epochs : int, default 50
+        Training length, in the middle of the paper's best range.
+    seed : int, default 0
+        Seed of the random draws.
+
+    Returns
+    -------
+    uint8 array of shape (height, width, 3)
+        Blue-green-red. Nodes are as many per point as in Fig. 1.
+    """
+    columns = []
+    for side in sides:
+        seeds = object_seeds(frame, side * side)
+        nodes = max(1, round(len(seeds.uv) * FIRST_NODES / FIRST_POINTS))
+        chosen = by_metric(NeuralGasSelector(nodes, epochs, "exact", seed).select(seeds))
+        columns.append((f"{side} × {side}", f"{len(seeds.uv):,} points, {nodes:,} nodes", chosen))
+    return _figure(frame, f"{epochs} epochs", columns)
+
+
+def _figure(
+    frame: DepthFrame,
+    note: str,
+    columns: Sequence[tuple[str, str, dict[EdgeMetric, RegionSelection]]],
+) -> Image:
+    """The object, then a column per training: nodes above, kept triangles by each metric below."""
+    shown = [_column("Object", note, [_shaded(frame)])]
+    for title, words, chosen in columns:
+        panels = [_nodes_panel(frame, chosen["3d"])]
+        panels += [_areas_panel(frame, chosen[metric]) for metric in METRICS]
+        shown.append(_column(title, words, panels))
+    height = max(column.shape[0] for column in shown)
+    out = np.full((height + 2 * GAP, (_PANEL_WIDTH + GAP) * len(shown) + GAP, 3), PAPER, np.uint8)
+    for place, column in enumerate(shown):
+        left = GAP + place * (_PANEL_WIDTH + GAP)
+        out[GAP : GAP + column.shape[0], left : left + _PANEL_WIDTH] = column
+    panel = (height - 58) // 3
+    for row, name in enumerate(("nodes", *(f"kept: {_NAMES[metric]}" for metric in METRICS))):
+        if row:
+            write_text(out, name, GAP, GAP + 58 + row * panel + panel // 2, 17, colour=INK)
+    foot = out.shape[0] - GAP
+    cv2.circle(out, (GAP + 6, foot - 6), 3, NODE, -1, cv2.LINE_AA)
+    write_text(out, "neural gas node", GAP + 18, foot, 15, colour=PALE)
+    return out
+
+
+def _column(title: str, note: str, panels: Sequence[Image]) -> Image:
+    head = np.full((58, _PANEL_WIDTH, 3), PAPER, np.uint8)
+    for text, baseline, size, weight, colour in (
+        (title, 22, 19, 600, INK),
+        (note, 44, 13, 400, PALE),
+    ):
+        left = (_PANEL_WIDTH - text_width(text, size, weight)) // 2
+        write_text(head, text, left, baseline, size, weight=weight, colour=colour)
+    height = round(panels[0].shape[0] * _PANEL_WIDTH / panels[0].shape[1])
+    fitted = [
+        cv2.resize(panel, (_PANEL_WIDTH, height), interpolation=cv2.INTER_AREA) for panel in panels
+    ]
+    return np.vstack([head, *fitted])
+
+
+def _shaded(frame: DepthFrame) -> Image:
+    """The object lit from the upper left."""
+    depth = frame.depth_mm.astype(np.float32)
+    smooth = cv2.GaussianBlur(depth, (0, 0), 1.5)
+    right, down = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8
+    # Slopes in mm per mm: a pixel is depth / focal length wide.
+    per_mm = frame.camera.fx / np.maximum(depth, 1)
+    light = (0.5 * right * per_mm + 0.6 * down * per_mm + 1) / np.sqrt(
+        1 + (right * per_mm) ** 2 + (down * per_mm) ** 2
+    )
+    grey = np.clip(90 + 105 * light, 40, 250).astype(np.uint8)
+    image = np.repeat(grey[:, :, None], 3, axis=2)
+    image[frame.depth_mm == 0] = PAPER
+    return image
+
+
+_SCALE = 2  # nodes and edges are finer than the pixels of the frame
+
+
+def _canvas(frame: DepthFrame) -> Image:
+    image = np.full((*frame.shape, 3), PAPER, np.uint8)
+    image[frame.depth_mm > 0] = _OBJECT
+    return np.repeat(np.repeat(image, _SCALE, axis=0), _SCALE, axis=1)
+
+
+def _nodes_panel(frame: DepthFrame, selection: RegionSelection) -> Image:
+    image = _canvas(frame)
+    for u, v in _on_canvas(selection.nodes_uv):
+        cv2.circle(image, (int(u), int(v)), 36, NODE, -1, cv2.LINE_AA, 4)
+    return image
+
+
+def _areas_panel(frame: DepthFrame, selection: RegionSelection) -> Image:
+    image = _canvas(frame)
+    corners = _on_canvas(selection.nodes_uv)[selection.triangles]
+    image[np.repeat(np.repeat(selection.mask, _SCALE, axis=0), _SCALE, axis=1)] = _AREA
+    cv2.polylines(image, list(corners[selection.kept]), True, (150, 122, 96), 1, cv2.LINE_AA, 4)
+    return image
+
+
+def _on_canvas(uv: npt.NDArray[np.float32]) -> npt.NDArray[np.int32]:
+    """Pixels of the frame as OpenCV's sixteenths of a pixel of the canvas."""
+    return np.round(((uv + 0.5) * _SCALE - 0.5) * 16).astype(np.int32)
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """One training of the table; shares are of the frame's pixels and squared error, 0..1.
+
+    Time is that of the processor, all threads together: it does not depend on what else runs.
+    """
+
+    nodes: int
+    training: str
+    seconds: float
+    quantisation_error_mm: float
+    mask_share: float
+    mask_error_share: float
+    complement_share: float
+    complement_error_share: float
+
+
+def node_table(
+    frames: Sequence[DepthFrame],
+    nodes: Sequence[int] = TABLE_NODES,
+    epochs: Sequence[int] = TABLE_EPOCHS,
+    seed: int = 0,
+) -> Iterator[TableRow]:
+    """What nodes and epochs cost, and what the regions read from them are worth.
+
+    Parameters
+    ----------
+    frames : sequence of DepthFrame
+        Frames to average over.
+    nodes, epochs : sequence of int
+        What to try: exact training of each, and one fast training per number of nodes.
+    seed : int, default 0
+        Seed of the random draws.
+
+    Yields
+    ------
+    TableRow
+        As soon as it is known. The interpolation error is that of the protocol's reconstruction
+        from the 128x128 seeds alone, at the pixels that have depth.
+    """
+    grids = [SeedGrid.from_frame(frame) for frame in frames]
+    # Compiled, and the seeds' points made, before anything is timed.
+    for grid in grids:
+        NeuralGasSelector(10, 1, "exact").select(grid)
+        NeuralGasSelector(10).select(grid)
+    squares = [_squared_error(frame, grid) for frame, grid in zip(frames, grids, strict=True)]
+    for count in nodes:
+        for length in (*epochs, None):
+            selector = NeuralGasSelector(count, length or 1, "exact" if length else "fast", seed)
+            rows = []
+            for grid, (square, known) in zip(grids, squares, strict=True):
+                start = time.process_time()
+                chosen = selector.select(grid)
+                seconds = time.process_time() - start
+                shares = [
+                    share
+                    for region in (chosen.mask, chosen.complement)
+                    for share in (
+                        float(region[known].mean()) if known.any() else 0.0,
+                        float(square[region].sum() / max(square.sum(), 1e-12)),
+                    )
+                ]
+                rows.append((seconds, chosen.quantisation_error_mm, *shares))
+            means = (float(value) for value in np.mean(rows, axis=0))
+            yield TableRow(count, f"{length} epochs" if length else "fast", *means)
+
+
+def _squared_error(
+    frame: DepthFrame, seeds: SeedGrid
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Squared error of the frame interpolated from its seeds, and where it is known."""
+    known = frame.depth_mm > 0
+    model = reconstruct(seeds.uv, seeds.depth_mm[seeds.valid], frame.shape)
+    return np.where(known, np.square(model - frame.depth_mm), 0).astype(np.float32), known
+
+
+def table_markdown(rows: Sequence[TableRow]) -> str:
+    """The table as Markdown."""
+    lines = [
+        "| nodes | training | CPU time, s | quantisation error, mm | mask: pixels | mask: error |"
+        " complement: pixels | complement: error |",
+        "|" + "---:|" * 8,
+    ]
+    for row in rows:
+        shares = " | ".join(
+            f"{share:.1%}"
+            for share in (
+                row.mask_share,
+                row.mask_error_share,
+                row.complement_share,
+                row.complement_error_share,
+            )
+        )
+        lines.append(
+            f"| {row.nodes:,} | {row.training} | {row.seconds:.3g} |"
+            f" {row.quantisation_error_mm:.2f} | {shares} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+# The commands
+
+
+def draw_epochs(source: str, out: Path, *, save: Path | None, number: int, seed: int) -> int:
+    """Make Fig. 1 of a frame of a source, and a Rerun recording of it; returns the exit code.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    UsageError
+        If the picture is of a kind that cannot be made, or there is no such frame.
+    """
+    check_picture(out)
+    frame = nth_frame(source, number)
+    seeds = object_seeds(frame, FIRST_POINTS)
+    with waiting(f"training {len(EPOCHS)} times"):
+        trained = list(epoch_selections(seeds, EPOCHS, FIRST_NODES, seed))
+    write_picture(out, epochs_figure(frame, seeds, trained))
+    say(f"wrote {out}")
+    if save is not None:
+        from selective_depth.app.viewer import save_trainings
+
+        save_trainings(save, frame, ((length, chosen["3d"]) for length, chosen in trained))
+        say(f"wrote {save}; open it with 'rerun {save}'")
+    return 0
+
+
+def draw_densities(source: str, out: Path, *, number: int, epochs: int, seed: int) -> int:
+    """Make Fig. 2 of a frame of a source; returns the exit code. Raises as `draw_epochs`."""
+    check_picture(out)
+    frame = nth_frame(source, number)
+    with waiting(f"training {len(DENSITIES)} times"):
+        figure = densities_figure(frame, DENSITIES, epochs, seed)
+    write_picture(out, figure)
+    say(f"wrote {out}")
+    return 0
+
+
+def tabulate_nodes(source: str, *, every: int | None, out: Path | None) -> int:
+    """Print the table of nodes and epochs, and write it; returns the exit code.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    UsageError
+        If `every` is not allowed.
+    """
+    if every is not None and every < 1:
+        raise UsageError(f"--every is {every}; it must be 1 or more.")
+    if out is not None and not out.resolve().parent.is_dir():
+        raise OutputError(f"'{out}' cannot be written: its folder does not exist.")
+    with open_source(source) as opened:
+        frames = list(islice(opened, 0, None if every else 1, every or 1))
+    if not frames:
+        raise UsageError(f"'{source}' has no frame to tabulate.")
+    rows = []
+    for row in node_table(frames, TABLE_NODES, TABLE_EPOCHS):
+        rows.append(row)
+        say(f"{row.nodes:,} nodes, {row.training}: {row.seconds:.3g} s")
+    table = table_markdown(rows)
+    say(table)
+    if out is not None:
+        write_output(out, table)
+    return 0

@@ -1,0 +1,137 @@
+"""The commands that deal with recordings as files: what is wrong with one, and saving frames."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.progress import FrameProgress, waiting
+from selective_depth.app.pipeline import say
+from selective_depth.drivers.folder import FolderWriter
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.oni import OniReport, OniWriter, export_oni, inspect_oni, repair_oni
+from selective_depth.drivers.open import open_source
+from selective_depth.drivers.source import DepthSource
+
+OK, FAILED = 0, 1
+MOST_PROBLEMS = 20
+
+
+def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
+    """Print what is in an .oni file and what is wrong with it; save what is readable if asked.
+
+    Returns
+    -------
+    int
+        Exit code: 0 if nothing is wrong (or a repaired file was written), else 1.
+    """
+    if not timeout_s > 0:
+        raise UsageError(f"--timeout is {timeout_s:g}; it must be more than 0.")
+    with waiting(f"Checking {path}"):
+        report = inspect_oni(path, decode=True, timeout_s=timeout_s)
+    _print_check(report)
+    if repair is not None:
+        with waiting(f"Writing {repair}"):
+            mended = repair_oni(path, repair)
+        say(f"wrote {repair}: {mended.readable_frames} depth frames, whole")
+        return OK
+    if report.swapped_frames:
+        say(
+            f"note: OpenNI2's recorder swapped the last pixels of {report.swapped_frames} frames;"
+            " they are read rightly here, but its own player shows them wrong. --repair OUT.oni"
+            " writes a file without the flaw"
+        )
+    if not report.complete and report.readable_frames:
+        say(
+            f"note: save what is readable with --repair OUT.oni, or as PNG files with"
+            f" 'selective-depth export {path} FOLDER'"
+        )
+    return OK if report.complete else FAILED
+
+
+def export(source: str, out: Path, frames: int | None) -> int:
+    """Save the frames of any source as a folder of PNG files, or as an .oni file.
+
+    Of an .oni file that is damaged, all that is readable is saved.
+
+    Returns
+    -------
+    int
+        Exit code 0.
+    """
+    if frames is not None and frames <= 0:
+        raise UsageError(f"--frames is {frames}; it must be more than 0.")
+    with FrameProgress(f"Writing {out}", frames) as progress:
+        to_oni = out.suffix.lower() == ".oni"
+        if Path(source).suffix.lower() == ".oni" and frames is None:
+            if to_oni:
+                count = repair_oni(source, out).readable_frames
+            else:
+                count = export_oni(source, out, progress.update).readable_frames
+        else:
+            with open_source(source) as opened:
+                if opened.frame_count is None and frames is None:
+                    raise UsageError(
+                        f"'{source}' never ends; say how many frames to save, as in --frames 100."
+                    )
+                count = _save(opened, out, to_oni, frames, progress)
+    say(f"wrote {out}: {count} frames")
+    return OK
+
+
+def _save(
+    source: DepthSource, out: Path, to_oni: bool, frames: int | None, progress: FrameProgress
+) -> int:
+    writer = OniWriter(out, fps=source.fps) if to_oni else FolderWriter(out, fps=source.fps)
+    count = 0
+    with writer:
+        wanted: islice[DepthFrame] = islice(source, frames)
+        for count, frame in enumerate(wanted, start=1):
+            writer.write(frame)
+            progress.update(count)
+    return count
+
+
+def _print_check(report: OniReport) -> None:
+    console = Console(highlight=False)
+    console.print(str(report.path), soft_wrap=True)
+    table = Table(box=None, pad_edge=False, show_header=False)
+    for justify in ("left", "right", "left"):
+        table.add_column("", justify=justify)
+    table.add_row("size", f"{report.size_bytes:,}", "bytes")
+    if report.tail_bytes:
+        table.add_row("of it unused, at the end", f"{report.tail_bytes:,}", "bytes")
+    if report.version:
+        table.add_row("version of the format", report.version, "")
+    for node in report.nodes:
+        if node.is_stream:
+            codec = node.codec.decode("ascii", "replace")
+            table.add_row(f"{node.name} ({codec})", f"{len(node.frames):,}", "frames")
+    if report.camera is not None:
+        table.add_row("frame size", f"{report.camera.width}x{report.camera.height}", "pixels")
+        table.add_row("focal length", f"{report.camera.fx:.1f}", "pixels")
+        table.add_row("frame rate", f"{report.fps:g}", "frames/s")
+        table.add_row("duration", f"{report.duration_s:.2f}", "s")
+    table.add_row("readable depth frames", f"{report.readable_frames:,}", "frames")
+    console.print(table)
+    for problem in report.problems[:MOST_PROBLEMS]:
+        console.print(str(problem), soft_wrap=True, markup=False)
+    if len(report.problems) > MOST_PROBLEMS:
+        console.print(f"and {len(report.problems) - MOST_PROBLEMS} problems more")
+    console.print(_verdict(report))
+
+
+def _verdict(report: OniReport) -> str:
+    if report.complete:
+        decoded, frames = report.decoded_frames, report.readable_frames
+        limit = "" if decoded == frames else f" (only {decoded} frames decoded; see --timeout)"
+        return f"nothing is wrong with it{limit}"
+    if report.openable:
+        return "it is incomplete, but can be replayed as far as it goes"
+    if not report.version:
+        return "it is no recording"
+    return "it is damaged: OpenNI2 must not be given this file"

@@ -1,0 +1,123 @@
+"""The multi-resolution model as files: its cloud, its dense depth, its samples."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from selective_depth.app.console.output import cannot_write, write_output
+from selective_depth.app.pictures.stills import ROUND_COLOURS
+from selective_depth.drivers.frame import Camera
+from selective_depth.selectors.acquire import Acquisition
+
+SEED_GREY = (150, 150, 150)
+
+
+def save_cloud(path: Path, acquisition: Acquisition, camera: Camera) -> int:
+    """Write the samples that returned depth as a point cloud (binary PLY).
+
+    Points are in millimetres, x right, y down, z forward; each has the `round` it was measured
+    in (0 = seed) and its colour in the pictures of this program.
+
+    Parameters
+    ----------
+    path : Path
+        A file that ends in .ply; overwritten.
+    acquisition : Acquisition
+        The model.
+    camera : Camera
+        Intrinsics of its frame.
+
+    Returns
+    -------
+    int
+        Number of points.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    kept = acquisition.returned
+    rounds = acquisition.round[kept]
+    vertex = np.empty(
+        int(kept.sum()),
+        [("xyz", "<f4", 3), ("rgb", "u1", 3), ("round", "u1")],
+    )
+    vertex["xyz"] = camera.points_mm(acquisition.uv[kept], acquisition.depth_mm[kept])
+    vertex["round"] = rounds
+    last = max(int(acquisition.round.max(initial=1)), 1)
+    steps = np.linspace(0, len(ROUND_COLOURS) - 1, last).astype(int)
+    colours = np.vstack((SEED_GREY, ROUND_COLOURS[steps][:, ::-1]))
+    vertex["rgb"] = colours[rounds]
+    header = "\n".join(
+        (
+            "ply",
+            "format binary_little_endian 1.0",
+            "comment selective-depth: millimetres, x right, y down, z forward; round 0 = seed",
+            f"element vertex {len(vertex)}",
+            *(f"property float {axis}" for axis in "xyz"),
+            *(f"property uchar {channel}" for channel in ("red", "green", "blue", "round")),
+            "end_header\n",
+        )
+    )
+    write_output(path, header.encode("ascii") + vertex.tobytes())
+    return len(vertex)
+
+
+def save_depth(path: Path, depth_mm: npt.NDArray[np.floating]) -> None:
+    """Write dense depth as a 16-bit PNG, whole millimetres, 0 = unknown.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    whole = np.clip(np.rint(np.nan_to_num(depth_mm)), 0, 65535).astype(np.uint16)
+    _, data = cv2.imencode(".png", whole)
+    write_output(path, data.tobytes())
+
+
+def save_samples(path: Path, acquisition: Acquisition) -> None:
+    """Write all measurements, also those that returned nothing, as NPZ.
+
+    It holds ``uv`` (column, row), ``depth_mm`` (0 = no return), ``round`` (0 = seed) and
+    ``shape`` (height, width); read it with ``numpy.load``.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    packed = io.BytesIO()
+    np.savez_compressed(
+        packed,
+        uv=acquisition.uv,
+        depth_mm=acquisition.depth_mm,
+        round=acquisition.round,
+        shape=np.array(acquisition.frame_shape, np.int32),
+    )
+    write_output(path, packed.getvalue())
+
+
+def save_model(folder: Path, acquisition: Acquisition, camera: Camera) -> list[Path]:
+    """Write ``cloud.ply``, ``depth.png`` and ``samples.npz`` into a folder, made if missing.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    cloud, depth, samples = (folder / n for n in ("cloud.ply", "depth.png", "samples.npz"))
+    save_cloud(cloud, acquisition, camera)
+    save_depth(depth, acquisition.reconstruct())
+    save_samples(samples, acquisition)
+    return [cloud, depth, samples]

@@ -1,0 +1,336 @@
+"""A run from its source to its report: where source, loop and viewer meet."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import re
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+from selective_depth.app.console import interrupt
+from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.output import write_picture
+from selective_depth.app.console.progress import FrameProgress, waiting
+from selective_depth.app.pictures.stills import StillRow, contact_sheet
+from selective_depth.app.pipeline import (
+    Arrival,
+    Loop,
+    RunReport,
+    StateNote,
+    Step,
+    count_samples,
+    is_settings,
+    print_report,
+    save_settings,
+    say,
+)
+from selective_depth.app.settings import Settings, ViewerOptions
+from selective_depth.app.viewer import Viewer, has_display
+from selective_depth.drivers.errors import (
+    DamagedRecordingError,
+    DeviceLostError,
+    OutputError,
+    SourceEndedError,
+    SourceTimeoutError,
+)
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.open import open_source
+from selective_depth.drivers.realtime import RealtimeSource
+from selective_depth.drivers.source import DepthSource
+from selective_depth.selectors.acquire import MOST_ROUNDS
+from selective_depth.selectors.parallel import default_threads
+
+log = logging.getLogger(__name__)
+
+OK, FAILED, INTERRUPTED = 0, 1, interrupt.EXIT_CODE
+MEMORY = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%", re.IGNORECASE)
+"""A size as the SDK reads it."""
+POLL_S = 0.5
+"""How long a live sensor may be silent before its state is shown."""
+
+
+def watch(uri: str, settings: Settings) -> int:
+    """Run a source through both selectors into the viewer, and print what it came to.
+
+    Parameters
+    ----------
+    uri : str
+        As for `open_source`.
+    settings : Settings
+        All options.
+
+    Returns
+    -------
+    int
+        Exit code: 0, 1 if something that was asked for failed, 130 after Ctrl-C.
+    """
+    check(settings)
+    session = Session(uri, settings)
+    code = session.run()
+    print_report(session.report)
+    return code
+
+
+def check(settings: Settings) -> None:
+    """Refuse options that contradict each other or lie outside their range.
+
+    Raises
+    ------
+    UsageError
+        Naming the option, its value and what is allowed.
+    """
+    run, spend, seen = settings.run, settings.acquire, settings.viewer
+    far_mm = 65535 if seen.far_mm is None else seen.far_mm
+    for option, value, allowed, good in (
+        ("--frames", run.frames, "1 or more", run.frames is None or run.frames >= 1),
+        ("--threads", run.threads, "1 or more", run.threads is None or run.threads >= 1),
+        ("--budget", spend.budget, "a share between 0 and 1", 0 <= spend.budget <= 1),
+        ("--rounds", spend.rounds, f"from 1 to {MOST_ROUNDS}", 1 <= spend.rounds <= MOST_ROUNDS),
+        ("--near-mm", seen.near_mm, "0 or more", (seen.near_mm or 0) >= 0),
+        ("--far-mm", far_mm, "more than --near-mm", far_mm > (seen.near_mm or 0)),
+    ):
+        if not good:
+            raise UsageError(f"{option} is {value}; it must be {allowed}.")
+    for option, size in (
+        ("--serve-memory", seen.serve_memory),
+        ("--viewer-memory", seen.viewer_memory),
+    ):
+        if not MEMORY.fullmatch(size):
+            raise UsageError(f"{option} is '{size}'; it must be a size, such as 256MiB or 25%.")
+    if seen.save is not None:
+        _check_save(seen.save)
+
+
+def _beside(saved: Path) -> tuple[Path, Path]:
+    """Where the settings and the picture of a saved run go."""
+    return saved.with_suffix(".toml"), saved.with_suffix(".png")
+
+
+def _check_save(path: Path) -> None:
+    """Refuse a name that is none of a Rerun recording, or whose neighbours would be lost."""
+    if path.suffix.lower() != ".rrd":
+        raise UsageError(f"--save is '{path}'; it must end in .rrd, as Rerun recordings do.")
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise UsageError(f"--save is {str(path)!r}; Rerun writes names in UTF-8 only.") from None
+    settings, picture = _beside(path)
+    ours = settings.is_file() and is_settings(settings)
+    for beside in (settings, picture):
+        if beside.exists() and not ours:
+            raise UsageError(
+                f"--save is '{path}', but '{beside}', which would be replaced by what is written"
+                " beside it, is not of an earlier run. Give another name."
+            )
+
+
+def _with_a_place(options: ViewerOptions, uri: str) -> ViewerOptions:
+    """Save to a file where nothing else was asked for and no window can be opened."""
+    asked = options.save or options.serve or options.connect or options.headless
+    if asked or has_display():
+        return options
+    path = Path("out", "live.rrd" if uri.startswith("openni") else "replay.rrd")
+    try:
+        path.parent.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"'{path}' cannot be written: {error.strerror}. Name another file with --save, or none"
+            " with --headless."
+        ) from None
+    say(f"No display here: saving to {path} instead; open it with 'rerun {path}'.")
+    return dataclasses.replace(options, save=path)
+
+
+class Session:
+    """One run.
+
+    Parameters
+    ----------
+    uri : str
+        As for `open_source`.
+    settings : Settings
+        All options, checked.
+
+    Attributes
+    ----------
+    report : RunReport
+        What it has come to.
+    last : Step or None
+        The last step.
+    """
+
+    def __init__(self, uri: str, settings: Settings) -> None:
+        self.settings = settings
+        self.report = RunReport(uri, live=False)
+        self._uri = uri
+        self.last: Step | None = None
+        self._code = OK
+        self._ready_s = 0.0
+
+    def run(self) -> int:
+        """Run to the end of the source, the asked number of frames, or Ctrl-C.
+
+        Returns
+        -------
+        int
+            Exit code, as for `watch`.
+        """
+        report = self.report
+        with ExitStack() as stack:
+            with waiting(f"Opening {self._uri}"):
+                source = stack.enter_context(open_source(self._uri))
+            if self.settings.run.realtime and not source.live:
+                source = stack.enter_context(RealtimeSource(source))
+            report.live = source.live
+            _tell(source)
+            seen = _with_a_place(self.settings.viewer, self._uri)
+            self.settings = dataclasses.replace(self.settings, viewer=seen)
+            loop = stack.enter_context(Loop(self.settings, realtime=source.live))
+            frames = _frames_in_all(self.settings.run.frames, source.frame_count)
+            viewer = Viewer(seen, live=source.live, times=loop.times, frames=frames)
+            if seen.serve:
+                say(f"Serving on {seen.serve_address}; join with 'rerun {viewer.served_url}'.")
+            try:
+                with interrupt.recognised():
+                    self._turn_all(source, loop, viewer)
+                if seen.serve and not report.live:
+                    say("All frames are served; Ctrl-C ends.")
+                    threading.Event().wait()
+            except KeyboardInterrupt:
+                self._code = INTERRUPTED
+            finally:
+                report.troubles += viewer.close()
+                if viewer.file_failed and self._code == OK:
+                    self._code = FAILED
+                report.missed = viewer.dropped
+                report.state = _state(source)
+                report.dropped = source.dropped - report.dropped_starting
+                report.stages = loop.times.summary()
+            if seen.save is not None and self.last is not None:
+                self._write_beside(seen.save, picture=not viewer.window)
+        return self._code
+
+    def _turn_all(self, source: DepthSource, loop: Loop, viewer: Viewer) -> None:
+        total = _frames_in_all(self.settings.run.frames, source.frame_count)
+        recent: deque[float] = deque(maxlen=31)
+        with FrameProgress(self._uri, total) as progress:
+            for step in loop.steps(self._frames(source, loop, viewer, progress)):
+                if not recent:
+                    recent.append(self._ready_s)
+                recent.append(time.monotonic())
+                fps = (len(recent) - 1) / (recent[-1] - recent[0])
+                self._show(step, fps, source, loop, viewer)
+                self.report.seconds = time.monotonic() - self._ready_s
+                progress.update(self.report.frames, f"{fps:.0f} frames/s")
+
+    def _frames(
+        self, source: DepthSource, loop: Loop, viewer: Viewer, progress: FrameProgress
+    ) -> Iterator[Arrival | None]:
+        """As many frames as asked for; None when a sensor is silent.
+
+        The first is handed on when everything is ready.
+        """
+        state, taken = _state(source), 0
+        while taken != self.settings.run.frames:
+            interrupt.check()
+            frame, own_ms = None, dict[str, float]()
+            try:
+                with loop.times.stage("read", own_ms):
+                    frame = source.read(POLL_S) if source.live else source.read()
+            except SourceEndedError:
+                return
+            except DamagedRecordingError as error:
+                self.report.troubles.append(str(error))
+                self._code = FAILED
+                return
+            except (SourceTimeoutError, DeviceLostError):
+                if not source.live:
+                    raise
+                viewer.show(StateNote(_state(source)))
+            if _state(source) != state:
+                state = _state(source)
+                reason = getattr(source, "state_reason", "")
+                progress.say(f"sensor {state}{': ' if reason else ''}{reason}")
+            if frame is None:
+                yield None
+                continue
+            if taken == 0:
+                self._get_ready(frame, loop, viewer)
+            elif taken == 1:
+                self.report.dropped_starting = source.dropped
+            taken += 1
+            yield Arrival(frame, state, own_ms["read"])
+
+    def _get_ready(self, frame: DepthFrame, loop: Loop, viewer: Viewer) -> None:
+        began_s = time.monotonic()
+        with waiting("Compiling for this machine; the next run starts at once"):
+            loop.warm_up(frame)
+            viewer.wait_ready()
+        self._ready_s = time.monotonic()
+        log.info("ready after %.1f s", self._ready_s - began_s)
+
+    def _show(
+        self, step: Step, fps: float, source: DepthSource, loop: Loop, viewer: Viewer
+    ) -> None:
+        self.report.take(step)
+        self.last = step
+        figures = {
+            "fps": fps,
+            "dropped_sensor": source.dropped,
+            "dropped_viewer": sum(viewer.dropped.values()),
+            "samples": count_samples(step),
+            "quantisation_error_mm": step.regions.quantisation_error_mm,
+        }
+        if step.model is not None:
+            figures["rmse_mm"] = step.model.rmse_mm
+        stages_ms = loop.times.last_ms() | step.stages_ms
+        viewer.show(dataclasses.replace(step, stages_ms=stages_ms, figures=figures))
+
+    def _write_beside(self, saved: Path, *, picture: bool) -> None:
+        """Settings and, where no window showed it, a picture of the last frame."""
+        settings_file, picture_file = _beside(saved)
+        save_settings(settings_file, self.settings, self._uri)
+        self.report.written += [saved, settings_file]
+        if picture and self.last is not None:
+            step = self.last
+            row = StillRow(
+                f"{self._uri.rstrip('/').rpartition('/')[2]}, frame {step.frame.index}",
+                step.frame,
+                step.regions,
+                step.improvement,
+                step.acquisition,
+            )
+            write_picture(picture_file, contact_sheet([row]))
+            self.report.written.append(picture_file)
+
+
+def _tell(source: DepthSource) -> None:
+    camera, count = source.camera, source.frame_count
+    log.info(
+        "%s: %s frames, %dx%d, %.4g frames/s, fx %.1f fy %.1f cx %.1f cy %.1f; %d kernel threads",
+        source.uri,
+        "endless" if count is None else count,
+        camera.width,
+        camera.height,
+        source.fps,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        default_threads(),
+    )
+
+
+def _frames_in_all(limit: int | None, count: int | None) -> int | None:
+    """How many frames will come at most; None where nobody knows."""
+    known = [number for number in (limit, count) if number is not None]
+    return min(known, default=None)
+
+
+def _state(source: DepthSource) -> str:
+    return "replay" if source.frame_count is not None else source.state

@@ -1,0 +1,84 @@
+"""The commands that deal with sensors alone: what is there, and recording it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from selective_depth.app.console import interrupt
+from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.progress import FrameProgress, waiting
+from selective_depth.app.pipeline import say
+from selective_depth.drivers.openni import list_devices, runtime_version
+from selective_depth.drivers.openni import record as record_oni
+from selective_depth.drivers.openni.runtime import find_runtime
+from selective_depth.drivers.openni.usb import usb_advice
+
+UNKNOWN_ADVICE = (
+    "Is it plugged in and powered? A Kinect for Xbox 360 needs libfreenect's OpenNI2 driver beside"
+    " the others; see 'Attach a sensor' in the README."
+)
+OK, FAILED, INTERRUPTED = 0, 1, interrupt.EXIT_CODE
+
+
+def print_devices() -> int:
+    """Print the sensors that OpenNI2 finds.
+
+    Returns
+    -------
+    int
+        Exit code: 0, or 1 if there is none.
+    """
+    runtime = find_runtime()
+    with waiting("Asking OpenNI2 for its sensors"):
+        found = list_devices()
+    say(f"OpenNI2 {runtime_version()}, {runtime.path}")
+    say(f"drivers: {', '.join(runtime.drivers) or 'none'}")
+    if not found:
+        say(f"no sensor found. {usb_advice(runtime.drivers) or UNKNOWN_ADVICE}")
+        return FAILED
+    table = Table(box=None, pad_edge=False)
+    for heading in ("device", "vendor", "name", "USB"):
+        table.add_column(heading, overflow="fold")
+    for each in found:
+        usb = f"{each.usb_vendor_id:04x}:{each.usb_product_id:04x}" if each.usb_vendor_id else ""
+        table.add_row(each.uri, each.vendor, each.name, usb)
+    Console(highlight=False).print(table)
+    return OK
+
+
+def record_sensor(
+    out: Path, device: str, *, frames: int | None, seconds: float | None, overwrite: bool
+) -> int:
+    """Record a sensor and say what became of it.
+
+    Returns
+    -------
+    int
+        Exit code: 0, 1 if frames are missing, 130 after Ctrl-C.
+    """
+    for option, value in (("--frames", frames), ("--seconds", seconds)):
+        if value is not None and not value > 0:  # NaN is not either
+            raise UsageError(f"{option} is {value}; it must be more than 0.")
+    interrupt.check()
+    interrupt.allow(interrupt.SAVE_S)
+    with FrameProgress(f"Recording {out}", frames) as progress:
+        report = record_oni(
+            out,
+            device,
+            frames=frames,
+            duration_s=seconds,
+            progress=progress.update,
+            overwrite=overwrite,
+        )
+    say(f"wrote {out}: {report.frames} frames, read back; it took {report.seconds:.1f} s")
+    if report.problem:
+        say(f"note: {report.problem}")
+    if report.ended == "interrupted":
+        return INTERRUPTED
+    if report.ended != "done":
+        say(f"note: it ended early: {report.ended}")
+        return FAILED
+    return FAILED if report.problem else OK

@@ -1,0 +1,99 @@
+"""Stills of one frame of each source: the contact sheet and every panel alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.output import cannot_write, write_picture
+from selective_depth.app.pictures.stills import StillRow, contact_sheet, panels
+from selective_depth.app.pipeline import Loop
+from selective_depth.app.settings import Settings
+from selective_depth.drivers.errors import SourceEndedError
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.open import open_source
+
+
+def short_name(uri: str) -> str:
+    """Name of a source for titles and file names: the last part of its path, or its scene."""
+    plain = uri.partition("?")[0].rstrip("/\\")
+    return Path(plain.replace(":", "/")).stem or "depth"
+
+
+def nth_frame(uri: str, number: int) -> DepthFrame:
+    """Return frame `number` of a source, counted from 0.
+
+    Raises
+    ------
+    UsageError
+        If the source has fewer frames.
+    """
+    with open_source(uri) as source:
+        for reached in range(number + 1):
+            try:
+                frame = source.read()
+            except SourceEndedError:
+                raise UsageError(
+                    f"--frame is {number}, but '{uri}' has {reached} frames; the last is"
+                    f" --frame {reached - 1}."
+                ) from None
+    return frame
+
+
+def still_row(frame: DepthFrame, title: str, settings: Settings) -> StillRow:
+    """Run both selectors, and the acquisition where there is a budget, on one frame."""
+    # One frame has no frame before it to go on from.
+    cold = replace(settings, gas=replace(settings.gas, training="cold"))
+    with Loop(cold) as loop:
+        step = loop.turn(frame)
+    return StillRow(title, frame, step.regions, step.improvement, step.acquisition)
+
+
+def snapshot(sources: Sequence[str], number: int, folder: Path, settings: Settings) -> list[Path]:
+    """Write a contact sheet with a row per source, and each panel alone.
+
+    Parameters
+    ----------
+    sources : sequence of str
+        As for `open_source`, at least one.
+    number : int
+        Which frame of each, from 0.
+    folder : Path
+        Where the pictures go; it is made if need be.
+    settings : Settings
+        Options of the seeds, the selectors and the acquisition.
+
+    Returns
+    -------
+    list of Path
+        What was written, the sheet first.
+
+    Raises
+    ------
+    UsageError
+        If there is no source, or one has no such frame.
+    OutputError
+        If the folder or a picture cannot be written.
+    """
+    if not sources:
+        raise UsageError("no source was named; give recordings, folders or scenes.")
+    names = [short_name(uri) for uri in sources]
+    rows = []
+    for at, (uri, name) in enumerate(zip(sources, names, strict=True)):
+        again = names[:at].count(name)
+        title = f"{name}-{again + 1}" if again else name
+        rows.append(still_row(nth_frame(uri, number), title, settings))
+    written = [folder / "sheet.png"]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    write_picture(written[0], contact_sheet(rows))
+    for row in rows:
+        for panel in panels(row):
+            path = folder / f"{row.title}-{panel.name}.png"
+            write_picture(path, panel.image)
+            written.append(path)
+    return written

@@ -1,0 +1,356 @@
+"""Is selecting worth it? Every strategy on the same frames, by the same protocol.
+
+Each strategy spends the same budget from the same seeds; `reconstruct` makes the same kind of
+model of what it measured, and the model is held against the full frame. RMSE is reported as its
+ratio to an even lattice of as many measurements, and as the share of the way from that lattice
+to an oracle that shoots at the largest true errors.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from selective_depth.app.console import interrupt
+from selective_depth.app.console.errors import UsageError
+from selective_depth.app.evaluation.strategies import STRATEGIES, Case
+from selective_depth.drivers.errors import SourceNotFoundError
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.open import open_source
+from selective_depth.selectors.acquire import MOST_ROUNDS, shots_of
+from selective_depth.selectors.parallel import default_threads
+from selective_depth.selectors.reconstruct import reconstruct
+
+WRONG_MM = 20.0
+"""A pixel off by more than this, and by more than `WRONG_SHARE` of its depth, is wrong."""
+WRONG_SHARE = 0.02
+ENDLESS_FRAMES = 120
+"""So much is looked at of a source without end."""
+
+Results = dict[str, dict[str, dict[str, float]]]
+"""Budget -> strategy -> figure, as the JSON file has it."""
+_Arguments = tuple[Sequence[float], int, tuple[int, int], int, Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """How far a model is from the frame it is of.
+
+    Parameters
+    ----------
+    rmse_mm, mae_mm : float
+        Root mean square and mean absolute error over the pixels with depth, millimetres.
+    wrong : float
+        Share of the pixels off by more than `WRONG_MM` and `WRONG_SHARE` of their depth.
+    shots : int
+        Measurements spent beyond the seeds.
+    missed : float
+        Share of all measurements that returned nothing.
+    """
+
+    rmse_mm: float
+    mae_mm: float
+    wrong: float
+    shots: int
+    missed: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one strategy made of one frame, once per random seed."""
+
+    frame: str
+    budget: float
+    strategy: str
+    errors: tuple[Errors, ...]
+
+
+def errors_of(model_mm: npt.NDArray[np.float32], frame: DepthFrame) -> tuple[float, float, float]:
+    """RMSE and MAE in mm and share of wrong pixels of a model, over the pixels with depth."""
+    valid = frame.depth_mm > 0
+    truth_mm = frame.depth_mm[valid].astype(np.float64)
+    error_mm = np.abs(model_mm[valid] - truth_mm)
+    wrong = error_mm > np.maximum(WRONG_MM, WRONG_SHARE * truth_mm)
+    return (
+        float(np.sqrt(np.mean(error_mm**2))),
+        float(np.mean(error_mm)),
+        float(np.mean(wrong)),
+    )
+
+
+def run_strategy(name: str, case: Case) -> Errors:
+    """Let a strategy spend its budget on one frame and see what came of it."""
+    uv = STRATEGIES[name].pixels(case)
+    depth_mm = case.frame.measure(uv)
+    model_mm = reconstruct(uv, depth_mm, case.frame.shape)
+    rmse_mm, mae_mm, wrong = errors_of(model_mm, case.frame)
+    return Errors(
+        rmse_mm, mae_mm, wrong, len(uv) - len(case.seed_uv), float(np.mean(depth_mm == 0))
+    )
+
+
+def _evaluate_frame(
+    frame: DepthFrame,
+    budgets: Sequence[float],
+    rounds: int,
+    seeds_shape: tuple[int, int],
+    random_seeds: int,
+    strategies: Sequence[str],
+) -> list[Outcome]:
+    label = f"{frame.source} {frame.index}"
+    outcomes = []
+    for budget in budgets:
+        shots = shots_of(float(budget), frame.shape)
+        for name in strategies:
+            draws = random_seeds if STRATEGIES[name].chance else 1
+            errors = tuple(
+                run_strategy(name, Case(frame, seeds_shape, shots, rounds, seed))
+                for seed in range(draws)
+            )
+            outcomes.append(Outcome(label, budget, name, errors))
+    return outcomes
+
+
+def _begin_worker() -> None:
+    # Frames are spread over processes; threads inside them would only fight for the cores.
+    os.environ["SELECTIVE_DEPTH_THREADS"] = "1"
+    # Ctrl-C goes to all processes of a terminal: the parent says what becomes of it, and a worker
+    # ends with its parent, however that ends.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+@contextmanager
+def _started_deaf_to_ctrl_c() -> Iterator[None]:
+    """Let processes that start meanwhile be deaf to Ctrl-C from their first moment."""
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def frames_of(sources: Sequence[str], every: int, frames: int | None) -> Iterator[DepthFrame]:
+    """Every n-th frame of each source that shows anything, at most so many of each."""
+    for uri in sources:
+        taken = 0
+        with open_source(uri) as source:
+            endless = source.frame_count is None
+            for frame in source:
+                if frame.index % every == 0 and frame.depth_mm.any():
+                    yield frame
+                    taken += 1
+                if taken == frames or (endless and frame.index + 1 >= ENDLESS_FRAMES):
+                    break
+
+
+def outcomes(
+    sources: Sequence[str],
+    *,
+    every: int = 20,
+    frames: int | None = None,
+    budgets: Sequence[float] = (0.05, 0.10),
+    rounds: int = 8,
+    seeds_shape: tuple[int, int] = (128, 128),
+    random_seeds: int = 3,
+    strategies: Sequence[str] = tuple(STRATEGIES),
+    jobs: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Outcome]:
+    """Run the strategies on frames of some sources.
+
+    Parameters
+    ----------
+    sources : sequence of str
+        As `open_source` takes them.
+    every : int, default 20
+        Take every n-th frame.
+    frames : int, optional
+        At most so many frames of each source.
+    budgets : sequence of float, default (0.05, 0.10)
+        Measurements beyond the seeds as shares of the frame's pixels.
+    rounds : int, default 8
+        Rounds of the closed loops.
+    seeds_shape : tuple of int, default (128, 128)
+        Rows and columns of the seed lattice.
+    random_seeds : int, default 3
+        How often strategies that draw at random are run.
+    strategies : sequence of str, optional
+        Names out of `STRATEGIES`; default all. "uniform" and "oracle" are always run.
+    jobs : int, optional
+        Processes; default one per processor, and 1 runs in this one.
+    progress : callable, optional
+        Called with the frames done and the frames in all, as far as they are known.
+
+    Raises
+    ------
+    UsageError
+        If an argument is out of its range, saying which and what is allowed.
+    SourceNotFoundError
+        If the sources hold no frame with depth.
+    """
+    if not sources:
+        raise UsageError("no source was named; give recordings, folders or scenes.")
+    _check(every, frames, budgets, rounds, random_seeds, strategies, jobs)
+    names = [n for n in STRATEGIES if n in strategies or n in ("uniform", "oracle")]
+    jobs = jobs or default_threads()
+    arguments = (budgets, rounds, seeds_shape, random_seeds, names)
+    total = _most(sources, every, frames)
+    found: dict[int, list[Outcome]] = {}
+
+    def keep(number: int, outcomes: list[Outcome]) -> None:
+        found[number] = outcomes
+        progress(len(found), total)
+
+    progress(0, total)
+    chosen = enumerate(frames_of(sources, every, frames))
+    if min(jobs, total) == 1:
+        for number, frame in chosen:
+            keep(number, _evaluate_frame(frame, *arguments))
+    else:
+        _spread(chosen, arguments, jobs, keep)
+    if not found:
+        raise SourceNotFoundError(
+            f"no frame with depth in {', '.join(sources)}; give another source or --every 1."
+        )
+    progress(len(found), len(found))
+    return [outcome for number in sorted(found) for outcome in found[number]]
+
+
+def _most(sources: Sequence[str], every: int, frames: int | None) -> int:
+    """How many frames `frames_of` finds, if all of them show something."""
+    total = 0
+    for uri in sources:
+        with open_source(uri) as source:
+            count = ENDLESS_FRAMES if source.frame_count is None else source.frame_count
+        total += min(-(-count // every), frames or count)
+    return total
+
+
+def _spread(
+    chosen: Iterator[tuple[int, DepthFrame]],
+    arguments: _Arguments,
+    jobs: int,
+    keep: Callable[[int, list[Outcome]], None],
+) -> None:
+    """Evaluate frames in so many processes, with no more of them in memory than keep these busy."""
+    # Spawned, not forked: the parent may hold threads and locks of other libraries.
+    spawn = multiprocessing.get_context("spawn")
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_worker)
+    under_way: dict[Future[list[Outcome]], int] = {}
+
+    def settle() -> None:
+        for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+            keep(under_way.pop(future), future.result())
+
+    done = False
+    try:
+        for number, frame in chosen:
+            # A worker whose start is cut short reports that nobody told it what to do.
+            with interrupt.deferred(), _started_deaf_to_ctrl_c():
+                under_way[pool.submit(_evaluate_frame, frame, *arguments)] = number
+            if len(under_way) == 2 * jobs:
+                settle()
+        while under_way:
+            settle()
+        done = True
+    finally:
+        if not done:  # after Ctrl-C, say: what is under way is not waited for
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.kill()
+        pool.shutdown(wait=done, cancel_futures=True)
+
+
+def _check(
+    every: int,
+    frames: int | None,
+    budgets: Sequence[float],
+    rounds: int,
+    random_seeds: int,
+    strategies: Sequence[str],
+    jobs: int | None,
+) -> None:
+    if not budgets:
+        raise UsageError("--budget names no share; give one or more, such as 0.05 0.10.")
+    for name, value in (("every", every), ("rounds", rounds), ("random-seeds", random_seeds)):
+        if value < 1:
+            raise UsageError(f"--{name} is {value}; it must be at least 1.")
+    if rounds > MOST_ROUNDS:
+        raise UsageError(f"--rounds is {rounds}; it must be at most {MOST_ROUNDS}.")
+    for name, limit in (("frames", frames), ("jobs", jobs)):
+        if limit is not None and limit < 1:
+            raise UsageError(f"--{name} is {limit}; it must be at least 1.")
+    for budget in budgets:
+        if not 0 < budget <= 1:
+            raise UsageError(
+                f"--budget is {budget}; it is a share of the frame's pixels between 0 and 1,"
+                " such as 0.05."
+            )
+    for name in strategies:
+        if name not in STRATEGIES:
+            raise UsageError(f"'{name}' is no strategy; there are {', '.join(STRATEGIES)}.")
+
+
+def summarise(found: Sequence[Outcome]) -> Results:
+    """Figures per budget and strategy over all frames (and random seeds).
+
+    ``geo`` and ``worst``: geometric mean and greatest of the RMSE ratio to `uniform`; ``share``
+    and ``share_min``: mean and least of the oracle share, the way covered from `uniform` to
+    `oracle`; ``rmse_mm``, ``mae_mm``, ``wrong``, ``missed``: means.
+    """
+    results: Results = {}
+    peers = {(o.frame, o.budget, o.strategy): o.errors[0].rmse_mm for o in found}
+    for budget in dict.fromkeys(o.budget for o in found):
+        table: dict[str, dict[str, float]] = {}
+        for name in dict.fromkeys(o.strategy for o in found):
+            ratios, shares, errors = [], [], []
+            for outcome in found:
+                if (outcome.budget, outcome.strategy) != (budget, name):
+                    continue
+                uniform = peers[outcome.frame, budget, "uniform"]
+                oracle = peers[outcome.frame, budget, "oracle"]
+                for error in outcome.errors:
+                    errors.append(error)
+                    if uniform > 0:
+                        ratios.append(error.rmse_mm / uniform)
+                    if uniform > oracle:
+                        shares.append((uniform - error.rmse_mm) / (uniform - oracle))
+            positive = np.maximum(ratios, 1e-9)
+            table[name] = {
+                "geo": float(np.exp(np.mean(np.log(positive)))) if ratios else 1.0,
+                "worst": max(ratios, default=1.0),
+                "share": float(np.mean(shares)) if shares else 0.0,
+                "share_min": min(shares, default=0.0),
+                "rmse_mm": float(np.mean([e.rmse_mm for e in errors])),
+                "mae_mm": float(np.mean([e.mae_mm for e in errors])),
+                "wrong": float(np.mean([e.wrong for e in errors])),
+                "missed": float(np.mean([e.missed for e in errors])),
+            }
+        results[f"{budget:.2f}" if round(budget, 2) == budget else f"{budget:g}"] = table
+    return results
+
+
+def evaluate(sources: Sequence[str], **options: object) -> Results:
+    """Run the strategies on frames of some sources and sum up (see `outcomes`)."""
+    return summarise(outcomes(sources, **options))  # type: ignore[arg-type]

@@ -1,0 +1,1 @@
+"""Pictures without a viewer: one palette, panels, sheets."""

@@ -1,0 +1,156 @@
+"""What a run came to: the table at its end, and the settings file beside its results."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from selective_depth.app.console.output import write_output
+from selective_depth.app.pipeline.result import Step
+from selective_depth.app.pipeline.timing import StageSummary
+from selective_depth.app.settings import Settings, to_toml
+
+HEADING = "Settings of a run of selective-depth"
+
+
+@dataclass
+class Mean:
+    """A running mean of the finite values it is given."""
+
+    total: float = 0.0
+    count: int = 0
+
+    def add(self, value: float) -> None:
+        """Take one value in."""
+        if math.isfinite(value):
+            self.total += value
+            self.count += 1
+
+    @property
+    def value(self) -> float:
+        """Their mean; NaN of none."""
+        return self.total / self.count if self.count else math.nan
+
+
+@dataclass
+class RunReport:
+    """Figures of a run, gathered step by step.
+
+    Parameters
+    ----------
+    source : str
+        What was run.
+    live : bool
+        Whether frames could be lost.
+    dropped_starting : int
+        Frames lost while everything was got ready with the first one.
+    dropped : int
+        Frames lost since then.
+    state : str
+        The sensor's at the end.
+    """
+
+    source: str
+    live: bool
+    frames: int = 0
+    seconds: float = 0.0
+    dropped_starting: int = 0
+    dropped: int = 0
+    missed: dict[str, int] = field(default_factory=dict)
+    stages: dict[str, StageSummary] = field(default_factory=dict)
+    state: str = ""
+    samples: Mean = field(default_factory=Mean)
+    quantisation_error_mm: Mean = field(default_factory=Mean)
+    rmse_mm: Mean = field(default_factory=Mean)
+    troubles: list[str] = field(default_factory=list)
+    written: list[Path] = field(default_factory=list)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of the whole loop: waiting, reading and handing over included."""
+        return self.frames / self.seconds if self.seconds else 0.0
+
+    def take(self, step: Step) -> None:
+        """Add a step."""
+        self.frames += 1
+        self.samples.add(count_samples(step))
+        self.quantisation_error_mm.add(step.regions.quantisation_error_mm)
+        if step.model is not None:
+            self.rmse_mm.add(step.model.rmse_mm)
+
+
+def count_samples(step: Step) -> int:
+    """Measurements of a step that returned depth, seeds included."""
+    if step.acquisition is None:
+        return int(step.seeds.valid.sum())
+    return int(step.acquisition.returned.sum())
+
+
+def say(sentence: str) -> None:
+    """Print a sentence on standard output."""
+    print(sentence, flush=True)
+
+
+def print_report(report: RunReport) -> None:
+    """Print the table of a run on standard output; without colours if that is no terminal."""
+    console = Console(highlight=False)
+    console.print(report.source, soft_wrap=True)  # a table would break a long path
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column("")
+    table.add_column("", justify="right")
+    table.add_column("")
+    table.add_row("frames", f"{report.frames:,}", "")
+    table.add_row("whole loop", f"{report.fps:.1f}", "frames/s")
+    if report.live:
+        table.add_row("skipped while starting", f"{report.dropped_starting:,}", "frames")
+        table.add_row("skipped to keep up", f"{report.dropped:,}", "frames")
+        table.add_row("sensor at the end", report.state, "")
+    for name, missed in report.missed.items():
+        table.add_row(f"not shown in {name}", f"{missed:,}", "frames")
+    table.add_row("samples with depth", f"{report.samples.value:,.0f}", "per frame")
+    if report.quantisation_error_mm.count:
+        table.add_row("quantisation error", f"{report.quantisation_error_mm.value:.1f}", "mm")
+    if report.rmse_mm.count:
+        table.add_row("model RMSE", f"{report.rmse_mm.value:.1f}", "mm")
+    console.print(table)
+    stages = Table(box=None, pad_edge=False)
+    stages.add_column("milliseconds")
+    for heading in ("p50", "p99", "max"):
+        stages.add_column(heading, justify="right")
+    for name, times in report.stages.items():
+        figures = (times.p50_ms, times.p99_ms, times.max_ms)
+        stages.add_row(name, *(f"{figure:.1f}" for figure in figures))
+    console.print()
+    console.print(stages)
+    if report.written:
+        console.print()
+    for path in report.written:
+        console.print(f"wrote {path}", soft_wrap=True)
+    for trouble in report.troubles:
+        console.print(f"note: {trouble}", soft_wrap=True)
+
+
+def is_settings(path: Path) -> bool:
+    """Whether a file is one that `save_settings` wrote."""
+    with path.open("rb") as file:
+        return file.read(len(HEADING) + 2) == f"# {HEADING}".encode()
+
+
+def save_settings(path: Path, settings: Settings, source: str) -> None:
+    """Write the settings of a run so that ``--settings`` reads them back.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    heading = f"{HEADING} {version('selective-depth')}, {made}."
+    text = to_toml(settings, f"{heading}\nsource: {source}".replace("\r", " "))
+    write_output(path, text)

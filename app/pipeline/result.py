@@ -1,0 +1,91 @@
+"""What one turn of the loop found: the record that viewer and reports are fed with."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.selectors.acquire import Acquisition
+from selective_depth.selectors.improvement import ImprovementSelection
+from selective_depth.selectors.neural_gas import RegionSelection
+from selective_depth.selectors.seeds import SeedGrid
+
+
+class Arrival(NamedTuple):
+    """A frame as it came from its source."""
+
+    frame: DepthFrame
+    state: str = "replay"
+    """The sensor's, as in `Step`."""
+    read_ms: float = math.nan
+    """How long it was waited for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The dense model made of all samples of a frame, and how far it is from that frame.
+
+    Parameters
+    ----------
+    depth_mm : float32 array of shape (height, width)
+        Depth at every pixel.
+    error_mm : float32 array of shape (height, width)
+        Absolute difference from the full frame; NaN where the frame has no depth.
+    rmse_mm : float
+        Root mean square of it; NaN for a frame without depth.
+    """
+
+    depth_mm: npt.NDArray[np.float32]
+    error_mm: npt.NDArray[np.float32]
+    rmse_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One frame and all that was made of it.
+
+    Parameters
+    ----------
+    frame : DepthFrame
+        What the sensor delivered.
+    seeds : SeedGrid
+        The first measurements.
+    regions : RegionSelection
+        What the neural gas selected.
+    improvement : ImprovementSelection
+        What the improvement map selected.
+    acquisition : Acquisition or None
+        Seeds and what was measured besides; None without a budget.
+    model : Model or None
+        The dense model, where one is at hand: of this frame, or of one shortly before it where
+        frames do not wait.
+    state : str
+        The sensor's: live, stalled, lost, reconnecting; or replay.
+    stages_ms : dict of str to float
+        Duration of each stage in milliseconds: this frame's own, but for `log`, and for `model`
+        where frames do not wait; those are the latest.
+    figures : dict of str to float
+        Running figures by name, those of `legend.FIGURES`.
+    """
+
+    frame: DepthFrame
+    seeds: SeedGrid
+    regions: RegionSelection
+    improvement: ImprovementSelection
+    acquisition: Acquisition | None = None
+    model: Model | None = None
+    state: str = "replay"
+    stages_ms: dict[str, float] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class StateNote:
+    """The sensor's state, told while there is no frame to tell it with."""
+
+    state: str

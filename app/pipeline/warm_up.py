@@ -1,0 +1,71 @@
+"""The first run ever compiles its kernels: half of them here, in a process beside it.
+
+Numba compiles one function at a time in a process, whatever the number of threads. What this
+process compiles lands in the cache that the other one reads.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.selectors.acquire import acquire
+from selective_depth.selectors.neural_gas import NeuralGasSelector
+from selective_depth.selectors.seeds import SeedGrid
+
+PATIENCE_S = 2.0
+"""Kernels that are in the cache are ready sooner than this."""
+
+
+@contextmanager
+def compiling_beside() -> Iterator[None]:
+    """Compile neural gas and acquisition beside what happens inside, if that takes its time."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start() -> None:
+        started.append(
+            subprocess.Popen(
+                [sys.executable, "-m", "selective_depth.app.pipeline.warm_up"],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+        )
+
+    timer = threading.Timer(PATIENCE_S, start)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+        # Whatever became of it: what is not in the cache is compiled where it is needed.
+        for process in started:
+            process.wait()
+    finally:
+        timer.cancel()
+        timer.join()  # it may be starting the process at this very moment
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+def main() -> None:
+    """Run the kernels of neural gas, acquisition and reconstruction on a small frame."""
+    depth_mm = np.full((96, 128), 2000, np.uint16)
+    depth_mm[30:60, 40:90] = 1200
+    depth_mm[:10, :10] = 0
+    frame = DepthFrame(depth_mm, 0, 0, Camera.kinect(128, 96))
+    seeds = SeedGrid.from_frame(frame, (24, 32))
+    gas = NeuralGasSelector(nodes=100)
+    for _ in range(2):
+        gas.update(seeds)
+    acquire(frame.measure, seeds, 0.05, rounds=2).reconstruct()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,18 @@
+"""`.oni` recordings without OpenNI2: inspected, read, written and repaired."""
+
+from selective_depth.drivers.oni.inspection import inspect_oni
+from selective_depth.drivers.oni.reader import OniReader
+from selective_depth.drivers.oni.repair import export_oni, mend_oni, repair_oni
+from selective_depth.drivers.oni.report import OniReport
+from selective_depth.drivers.oni.writer import OniWriter, write_oni
+
+__all__ = [
+    "OniReader",
+    "OniReport",
+    "OniWriter",
+    "export_oni",
+    "inspect_oni",
+    "mend_oni",
+    "repair_oni",
+    "write_oni",
+]

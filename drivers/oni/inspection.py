@@ -1,0 +1,489 @@
+"""What is in an .oni file, and what is wrong with it, without OpenNI2.
+
+OpenNI2's own player trusts its input: a wrong size or count in a file overruns its buffers, and
+the process is gone. Here the chain of records is walked and every number is checked that the
+player would rely on, before it gets to see the file.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from selective_depth.drivers.errors import DamagedRecordingError, SourceNotFoundError
+from selective_depth.drivers.frame import Camera
+from selective_depth.drivers.oni.records import (
+    BEGIN_FIELDS,
+    CODEC_TABLE,
+    CODECS,
+    DEPTH_CODECS,
+    FILE_HEADER,
+    FRAME_FIELDS,
+    IDENTITY,
+    MAGIC,
+    MAX_PAYLOAD,
+    NODE_ADDITIONS,
+    OLD_SEEK_ENTRY,
+    OLDEST_VERSION,
+    PROPERTIES,
+    SEEK_ENTRY,
+    UNKNOWN_COUNT,
+    VERSION,
+    Kind,
+    NodeType,
+    Record,
+    RecordError,
+    parse_addition,
+    parse_property,
+    read_record,
+)
+from selective_depth.drivers.oni.report import (
+    STREAMS,
+    OniFrame,
+    OniNode,
+    OniProblem,
+    OniReport,
+)
+
+_MAX_NODES: Final = 64
+_MILLIMETRES: Final = 100
+"""OpenNI2's number of the pixel format "depth in millimetres"."""
+_SIZES: Final = {
+    "xnMapOutputMode": 12,
+    "xnCropping": 12,
+    "xnFOV": 16,
+    "xnRealWorldTranslationData": 24,
+}
+_SCAN_BYTES: Final = 1 << 20
+
+
+def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10.0) -> OniReport:
+    """Check an .oni file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file. Anything that is a regular file gets a report.
+    decode : bool, default False
+        Also decode every depth frame (about 1 ms each at 640x480), which finds most of the damage
+        inside of frames. The format has no checksums: some of it cannot be found.
+    timeout_s : float, default 10
+        Stop after so many seconds. Frames not decoded by then are not, see `decoded_frames`; a
+        file not walked through by then has a problem more, saying so.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If there is no such file, it is no regular file (a folder, a pipe, a device) or cannot be
+        read.
+    """
+    path = Path(path)
+    with open_regular(path) as file:
+        try:
+            return _Inspection(path, file, timeout_s).report(decode)
+        except OSError as error:
+            raise _unreadable(path, error) from error
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading, unbuffered, unless reading it could take for ever.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If there is no such file, it is no regular file (a folder, a pipe, a device) or cannot be
+        opened.
+    """
+    try:
+        if not path.exists():
+            raise SourceNotFoundError(f"'{path}' does not exist; check its name.")
+        if not path.is_file():
+            what = "a folder" if path.is_dir() else "no regular file"
+            raise SourceNotFoundError(f"'{path}' is {what}; give a recording, FILE.oni.")
+        return path.open("rb", buffering=0)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: OSError) -> SourceNotFoundError:
+    return SourceNotFoundError(
+        f"'{path}' cannot be read ({error.strerror}); check its name and its permissions."
+    )
+
+
+class _Inspection:
+    """One walk over a file."""
+
+    def __init__(self, path: Path, file: BinaryIO, timeout_s: float) -> None:
+        self.path = path
+        self.file = file
+        self.size = os.fstat(file.fileno()).st_size
+        self.deadline = time.monotonic() + timeout_s
+        self.problems: list[OniProblem] = []
+        self.nodes: dict[int, OniNode] = {}
+        self.version = ""
+        self.old = False
+        self.latest_us = 0
+        self.highest_node = 0
+        self.begun = False
+        self.end: int | None = None
+
+    def report(self, decode: bool) -> OniReport:
+        if self._read_header():
+            self._walk()
+            self._check_counts()
+        depth = next((n for n in self.nodes.values() if n.node_type == NodeType.DEPTH), None)
+        camera, fps, decoded, swapped = None, 30.0, 0, 0
+        if depth is not None:
+            camera, fps = self._check_depth(depth)
+            if camera is None:
+                depth.frames.clear()
+            elif decode:
+                decoded, swapped = self._decode_frames(depth, camera)
+        elif self.version:
+            self._problem(0, "the file holds no depth stream")
+        return OniReport(
+            path=self.path,
+            size_bytes=self.size,
+            version=self.version,
+            nodes=tuple(self.nodes.values()),
+            depth=depth,
+            camera=camera,
+            fps=fps,
+            problems=tuple(sorted(self.problems, key=lambda problem: problem.offset)),
+            ended=self.end is not None,
+            tail_bytes=0 if self.end is None else self.size - self.end,
+            old=self.old,
+            decoded_frames=decoded,
+            swapped_frames=swapped,
+        )
+
+    def _problem(self, offset: int, sentence: str, *, harmless: bool = False) -> None:
+        self.problems.append(OniProblem(offset, sentence, harmless))
+
+    def _out_of_time(self, offset: int) -> bool:
+        if time.monotonic() < self.deadline:
+            return False
+        self._problem(offset, "checking took too long and stopped here")
+        return True
+
+    def _read_header(self) -> bool:
+        start = self.file.read(FILE_HEADER.size)
+        if start[:4] != IDENTITY:
+            self._problem(
+                0,
+                "the file is empty"
+                if not start
+                else f"this is no .oni file: it begins with {start[:4]!r} instead of {IDENTITY!r}",
+            )
+            return False
+        if len(start) < FILE_HEADER.size:
+            self._problem(len(start), "the file ends inside its header")
+            return False
+        _, *version, self.latest_us, self.highest_node = FILE_HEADER.unpack(start)
+        if not OLDEST_VERSION <= tuple(version) <= VERSION:
+            numbers = ".".join(map(str, version))
+            self._problem(4, f"version {numbers} of the format is not known, only up to 1.0.1.0")
+            return False
+        self.version = ".".join(map(str, version))
+        self.old = tuple(version) < VERSION
+        if self.highest_node > _MAX_NODES:
+            self._problem(20, f"the header tells of {self.highest_node} streams")
+        return True
+
+    def _walk(self) -> None:
+        offset = FILE_HEADER.size
+        while offset < self.size and not self._out_of_time(offset):
+            try:
+                record = read_record(self.file, offset, self.size, self.old)
+            except RecordError as error:
+                found = self._next_record(offset + 1)
+                # A recorder that was stopped leaves half a record at the very end.
+                self._problem(offset, f"{error}", harmless=found is None and self._cut(error))
+                if found is None:
+                    break
+                offset = found
+                continue
+            try:
+                self._handle(record)
+            except RecordError as error:
+                self._problem(offset, f"a {record.kind.name} record is wrong: {error}")
+            offset = record.end
+            if record.kind is Kind.END:
+                self.end = offset
+                return
+        self._problem(self.size, "the file ends without its END mark", harmless=True)
+
+    @staticmethod
+    def _cut(error: RecordError) -> bool:
+        return str(error).startswith("the file ends")
+
+    def _next_record(self, offset: int) -> int | None:
+        """Offset of the next sound record at or after an offset, None if there is none."""
+        for found in self._find_magic(offset):
+            try:
+                record = read_record(self.file, found, self.size, self.old)
+            except RecordError:
+                continue
+            if record.node in self.nodes or record.kind in (*NODE_ADDITIONS, Kind.END):
+                return found
+        return None
+
+    def _find_magic(self, offset: int) -> Iterator[int]:
+        while offset < self.size and not self._out_of_time(offset):
+            offset = _skip_hole(self.file, offset)
+            self.file.seek(offset)
+            block = self.file.read(_SCAN_BYTES)
+            at = block.find(MAGIC)
+            while at >= 0:
+                yield offset + at
+                at = block.find(MAGIC, at + 1)
+            if len(block) < len(MAGIC):
+                return
+            offset += len(block) - len(MAGIC) + 1
+
+    def _handle(self, record: Record) -> None:
+        if record.undone_offset >= record.offset:
+            raise RecordError(f"it refers ahead, to byte {record.undone_offset}")
+        if record.kind in NODE_ADDITIONS:
+            self._add_node(record)
+        elif record.kind is not Kind.END:
+            node = self.nodes.get(record.node)
+            if node is None:
+                raise RecordError(f"there is no node {record.node}")
+            if node.removed and record.kind is not Kind.SEEK_TABLE:
+                raise RecordError(f"node {record.node} was removed before")
+            if record.kind in PROPERTIES:
+                _set_property(node, record)
+            elif record.kind is Kind.STATE_READY:
+                node.ready = True
+            elif record.kind is Kind.DATA_BEGIN:
+                self._begin(node, record)
+            elif record.kind is Kind.NEW_DATA:
+                self._add_frame(node, record)
+            elif record.kind is Kind.NODE_REMOVED:
+                node.removed = True
+            else:
+                self._check_seek_table(node, record)
+        if record.payload_size and record.kind not in (Kind.NEW_DATA, Kind.SEEK_TABLE):
+            raise RecordError(f"it has {record.payload_size} bytes of payload but needs none")
+
+    def _add_node(self, record: Record) -> None:
+        addition = parse_addition(record, self.old)
+        if record.node in self.nodes:
+            raise RecordError(f"node {record.node} was added before")
+        self.nodes[record.node] = OniNode(
+            record.node,
+            addition.name,
+            addition.node_type,
+            addition.codec,
+            addition.frames,
+            addition.seek_table_offset,
+            record.offset,
+        )
+        if record.node > self.highest_node:
+            raise RecordError(
+                f"node {record.node} is beyond the highest that the header states,"
+                f" {self.highest_node}"
+            )
+        if addition.node_type in STREAMS and addition.codec not in CODECS:
+            raise RecordError(f"the compression {addition.codec!r} is not known")
+
+    def _begin(self, node: OniNode, record: Record) -> None:
+        if len(record.fields) != BEGIN_FIELDS.size:
+            raise RecordError(f"it has {len(record.fields)} bytes of fields")
+        if not node.is_stream:
+            raise RecordError(f"node {node.number} delivers no frames")
+        self.begun = True
+        frames, _ = BEGIN_FIELDS.unpack(record.fields)
+        if node.declared_frames is None and frames != UNKNOWN_COUNT:
+            node.declared_frames = frames  # where versions before 1.0.0.5 keep it
+
+    def _add_frame(self, node: OniNode, record: Record) -> None:
+        if len(record.fields) != FRAME_FIELDS.size:
+            raise RecordError(f"it has {len(record.fields)} bytes of fields")
+        if not (node.is_stream and node.ready and self.begun):
+            raise RecordError(f"node {node.number} was not ready for frames")
+        timestamp_us, number = FRAME_FIELDS.unpack(record.fields)
+        last = node.frames[-1] if node.frames else None
+        if number != (last.number if last else 0) + 1:
+            self._problem(
+                record.offset,
+                f"frame {number} follows frame {last.number if last else 0} of {node.name}",
+            )
+            if last is not None and number <= last.number:
+                return
+        if timestamp_us > self.latest_us:
+            self._problem(record.offset, f"frame {number} is later than the recording's end")
+        elif last is not None and timestamp_us < last.timestamp_us:
+            self._problem(
+                record.offset, f"frame {number} is older than the one before it", harmless=True
+            )
+        node.frames.append(
+            OniFrame(
+                number, timestamp_us, record.offset, record.payload_offset, record.payload_size
+            )
+        )
+
+    def _check_seek_table(self, node: OniNode, record: Record) -> None:
+        form = OLD_SEEK_ENTRY if self.old else SEEK_ENTRY
+        if record.offset != node.seek_table_offset:
+            raise RecordError(f"node {node.number} expects it at byte {node.seek_table_offset}")
+        if record.payload_size != (len(node.frames) + 1) * form.size:
+            raise RecordError(
+                f"it has {record.payload_size // form.size - 1} entries for {len(node.frames)}"
+                " frames"
+            )
+        node.has_seek_table = True
+        self.file.seek(record.payload_offset)
+        table = self.file.read(record.payload_size)
+        if len(table) != record.payload_size:
+            raise RecordError("the file became shorter while it was read")
+        for frame, entry in zip(node.frames, list(form.iter_unpack(table))[1:], strict=True):
+            if (entry[0], entry[2]) != (frame.timestamp_us, frame.record_offset):
+                self._problem(
+                    record.offset,
+                    f"the seek table and frame {frame.number} disagree on its place or time",
+                )
+                return
+
+    def _check_counts(self) -> None:
+        if not self.begun:
+            self._problem(self.size, "the recording never began")
+        for node in self.nodes.values():
+            if not node.is_stream:
+                continue
+            there = len(node.frames)
+            if node.declared_frames is None:
+                self._problem(
+                    node.offset,
+                    f"the number of {node.name} frames was never written: the recorder was stopped",
+                    harmless=node.seek_table_offset == 0,
+                )
+            elif node.declared_frames != there:
+                self._problem(
+                    self.size,
+                    f"{node.declared_frames} {node.name} frames are announced, {there} are there",
+                )
+            if node.seek_table_offset and node.declared_frames and not node.has_seek_table:
+                self._problem(
+                    self.size,
+                    f"there is no sound seek table of {node.name} at byte {node.seek_table_offset}",
+                )
+
+    def _check_depth(self, node: OniNode) -> tuple[Camera | None, float]:
+        """Camera and frame rate of the depth stream, after checking what the player relies on."""
+        mode = node.values_of("xnMapOutputMode", "<III")
+        if mode is None:
+            self._problem(node.offset, "the frame size is not recorded")
+            return None, 30.0
+        width, height, fps = (int(value) for value in mode)
+        if not (width and height and 2 * width * height <= MAX_PAYLOAD and 1 <= fps <= 1000):
+            self._problem(node.offset, f"the frames cannot be {width}x{height} at {fps} a second")
+            return None, 30.0
+        if node.codec not in DEPTH_CODECS:
+            return None, fps
+        pixel_format = node.number_of("oniPixelFormat")
+        if pixel_format not in (None, _MILLIMETRES):
+            self._problem(
+                node.offset, f"the pixels have format {pixel_format}, which is not millimetres"
+            )
+            return None, fps
+        cropping = node.values_of("xnCropping", "<IHHHH")
+        if cropping is None:
+            self._problem(
+                node.offset, "the cropping is not recorded: OpenNI2 would deliver no frame at all"
+            )
+        elif cropping[0]:
+            self._problem(node.offset, "the frames are cropped, which cannot be replayed")
+            return None, fps
+        frame_bytes = node.number_of("oniRequiredFrameSize")
+        if frame_bytes not in (None, 2 * width * height):
+            del node.properties["oniRequiredFrameSize"]
+            self._problem(
+                node.offset, f"frames of {width}x{height} do not have {frame_bytes} bytes"
+            )
+        max_depth_mm = node.number_of("xnDeviceMaxDepth")
+        if node.codec == CODEC_TABLE and not 1 <= (max_depth_mm or 0) < 65536:
+            node.properties.pop("xnDeviceMaxDepth", None)
+            self._problem(node.offset, f"the largest depth cannot be {max_depth_mm} mm")
+        return self._camera(node, width, height), fps
+
+    def _camera(self, node: OniNode, width: int, height: int) -> Camera:
+        fov_rad = node.values_of("xnFOV", "<dd")
+        optics = node.values_of("xnRealWorldTranslationData", "<ddd")
+        try:
+            if fov_rad is None and optics is not None:
+                # OpenNI 1 at first recorded the size of a pixel at a distance instead.
+                distance, pixel_size, pixels_to_depth = optics
+                focal = distance / (pixel_size * pixels_to_depth)
+                return Camera(width, height, focal, focal, width / 2, height / 2)
+            if fov_rad is not None:
+                return Camera.from_fov(width, height, *fov_rad)
+        except (ValueError, ArithmeticError) as error:
+            node.properties.pop("xnFOV", None)
+            self._problem(node.offset, f"the field of view is wrong: {error}")
+        return Camera.kinect(width, height)
+
+    def _decode_frames(self, node: OniNode, camera: Camera) -> tuple[int, int]:
+        """Drop the frames that cannot be decoded, as far as time allows.
+
+        Returns how many can, and how many of these the recorder swapped the last pixels of.
+        """
+        # Compiled code, whose import takes longer than a whole check without it.
+        from selective_depth.drivers.oni.codec import decode_depth, mend_order
+
+        decoded, swapped, sound = 0, 0, []
+        size = camera.height, camera.width
+        for frame in node.frames:
+            if time.monotonic() < self.deadline:
+                payload = read_payload(self.file, frame)
+                if decode_depth(node.codec, payload, *size) is None:
+                    self._problem(frame.record_offset, f"frame {frame.number} cannot be decoded")
+                    continue
+                decoded += 1
+                swapped += node.codec == CODEC_TABLE and mend_order(payload, *size) is not None
+            sound.append(frame)
+        node.frames[:] = sound
+        return decoded, swapped
+
+
+def _skip_hole(file: BinaryIO, offset: int) -> int:
+    """First byte at or after an offset that is really on the disk."""
+    if sys.platform != "linux":
+        return offset
+    try:
+        return os.lseek(file.fileno(), offset, os.SEEK_DATA)
+    except OSError as error:
+        # Nothing but a hole up to the end; or a file system that does not know.
+        return file.seek(0, os.SEEK_END) if error.errno == errno.ENXIO else offset
+
+
+def read_payload(file: BinaryIO, frame: OniFrame) -> bytes:
+    """Compressed data of a frame.
+
+    Raises
+    ------
+    DamagedRecordingError
+        If the disk does not give it.
+    """
+    try:
+        file.seek(frame.payload_offset)
+        return file.read(frame.payload_size)
+    except OSError as error:
+        raise DamagedRecordingError(
+            f"'{file.name}' cannot be read at byte {frame.payload_offset} ({error.strerror});"
+            " is its disk in order?"
+        ) from error
+
+
+def _set_property(node: OniNode, record: Record) -> None:
+    name, value = parse_property(record)
+    if len(value) != _SIZES.get(name, len(value)):
+        raise RecordError(f"the property {name} has {len(value)} bytes, not {_SIZES[name]}")
+    node.properties[name] = (record.kind, value)

@@ -1,0 +1,106 @@
+"""Replay of .oni files without OpenNI2."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+from selective_depth.drivers.errors import DamagedRecordingError, SourceEndedError
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.oni.codec import decode_depth
+from selective_depth.drivers.oni.inspection import inspect_oni, open_regular, read_payload
+from selective_depth.drivers.oni.report import OniFrame, OniReport
+from selective_depth.drivers.source import DepthSource
+
+
+class OniReader(DepthSource):
+    """The depth frames of an .oni file, each exactly once, decoded here.
+
+    Delivers what was recorded, bit by bit, needs no runtime and runs no native code on the file.
+    A damaged file is read up to the damage; a recording whose recorder was killed is read to its
+    last whole frame.
+
+    Parameters
+    ----------
+    path : str or Path
+        The recording.
+
+    Attributes
+    ----------
+    report : OniReport
+        What was found in the file.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If there is no such file.
+    DamagedRecordingError
+        If it is no recording, or no frame comes before the damage.
+    """
+
+    live = False
+
+    def __init__(self, path: str | Path) -> None:
+        self.uri = str(path)
+        self.report = inspect_oni(path)
+        self.dropped = 0
+        self._frames, self._damage = _trusted_frames(self.report)
+        if self._damage is not None and not self._frames:
+            raise DamagedRecordingError(self._sentence(self._damage))
+        if not self._frames or self.report.depth is None or self.report.camera is None:
+            raise DamagedRecordingError(f"'{path}' holds no depth frames; was it ever recorded to?")
+        self.camera = self.report.camera
+        self.fps = self.report.fps
+        self.frame_count = len(self._frames)
+        self._codec = self.report.depth.codec
+        self._next = 0
+        self._file: BinaryIO | None = open_regular(self.report.path)
+
+    def read(self, timeout_s: float = 5.0) -> DepthFrame:
+        """Return the next frame; `timeout_s` does not matter, a file does not keep one waiting.
+
+        Raises
+        ------
+        SourceEndedError
+            After the last frame.
+        DamagedRecordingError
+            Where the file is damaged; frames already delivered are good.
+        """
+        if self._file is None:
+            raise SourceEndedError(f"'{self.uri}' has been closed.")
+        if self._next == len(self._frames):
+            if self._damage is not None:
+                raise DamagedRecordingError(self._sentence(self._damage))
+            raise SourceEndedError(f"'{self.uri}' has ended after {self._next} frames.")
+        frame = self._frames[self._next]
+        depth_mm = decode_depth(
+            self._codec, read_payload(self._file, frame), self.camera.height, self.camera.width
+        )
+        if depth_mm is None:
+            self._frames = self._frames[: self._next]
+            self._damage = f"byte {frame.record_offset}: frame {frame.number} cannot be decoded"
+            raise DamagedRecordingError(self._sentence(self._damage))
+        index = self._next
+        self._next += 1
+        return DepthFrame(depth_mm, index, frame.timestamp_us, self.camera, self.uri)
+
+    def close(self) -> None:
+        """Close the file. Harmless when called twice."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _sentence(self, damage: str) -> str:
+        return (
+            f"'{self.uri}' cannot be read beyond frame {len(self._frames)} ({damage})."
+            " `selective-depth check` says what can be saved."
+        )
+
+
+def _trusted_frames(report: OniReport) -> tuple[list[OniFrame], str | None]:
+    """Frames before the first damage, and what that is; None if the file is sound."""
+    frames = report.depth.frames if report.depth is not None else []
+    damage = next((problem for problem in report.problems if not problem.harmless), None)
+    if damage is None:
+        return frames, None
+    return [frame for frame in frames if frame.record_offset < damage.offset], str(damage)

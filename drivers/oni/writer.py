@@ -1,0 +1,321 @@
+"""Writing .oni files that OpenNI2 replays: from frames of any source, without a sensor."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Final, Self
+
+from selective_depth.drivers.errors import OutputError
+from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.oni.codec import encode_depth
+from selective_depth.drivers.oni.records import (
+    BEGIN_FIELDS,
+    CODEC_TABLE,
+    FILE_HEADER,
+    FRAME_FIELDS,
+    IDENTITY,
+    LATEST_TIME,
+    MAX_PAYLOAD,
+    SEEK_ENTRY,
+    UNKNOWN_COUNT,
+    VERSION,
+    Kind,
+    NodeAddition,
+    NodeType,
+    pack_addition,
+    pack_property,
+    pack_record,
+)
+from selective_depth.drivers.source import DepthSource
+
+_MAX_DEPTH_MM: Final = 65535
+_DEPTH_1_MM: Final = 100  # OpenNI2's number of this pixel format
+_GREY_16_BIT: Final = 4  # and OpenNI 1's
+_DEFAULT_FPS: Final = 30.0
+
+Property = tuple[Kind, bytes]
+
+
+def integer(value: int) -> Property:
+    """A whole-number property."""
+    return Kind.INT_PROPERTY, value.to_bytes(8, "little")
+
+
+def structure(form: str, *values: float) -> Property:
+    """A structured property."""
+    return Kind.GENERAL_PROPERTY, struct.pack(form, *values)
+
+
+class RecordWriter:
+    """Writes the nodes and frames of an .oni file, and at the end all that points to them.
+
+    Until `close`, the file looks like one whose recorder was killed: OpenNI2 and `inspect_oni`
+    read what is there. If it cannot be written to its end, it is removed: what it was to hold is
+    still where it came from, and the next attempt shall not find it in its way.
+
+    Parameters
+    ----------
+    path : Path
+        The file; must not exist.
+
+    Raises
+    ------
+    OutputError
+        If it exists, or cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._file: BinaryIO = path.open("xb")
+        except FileExistsError:
+            raise OutputError(
+                f"'{path}' exists already; give another name, or remove it."
+            ) from None
+        except OSError as error:
+            raise self._failed(error) from error
+        self._offset = 0
+        self._nodes: dict[int, NodeAddition] = {}
+        self._node_offsets: dict[int, int] = {}
+        self._entries: dict[int, list[tuple[int, int, int]]] = {}
+        self._latest_us = 0
+        self._append(self._header(LATEST_TIME))
+
+    def add_node(
+        self, number: int, addition: NodeAddition, properties: dict[str, Property]
+    ) -> None:
+        """Add a stream and what is known of it."""
+        self._nodes[number] = addition
+        self._entries[number] = []
+        self._node_offsets[number] = self._append(
+            pack_record(Kind.NODE_ADDED, number, pack_addition(addition))
+        )
+        for name, (kind, value) in properties.items():
+            self._append(pack_record(kind, number, pack_property(name, value)))
+        self._append(pack_record(Kind.STATE_READY, number))
+
+    def begin(self) -> None:
+        """Announce the frames, once all nodes are there."""
+        for number, addition in self._nodes.items():
+            if addition.node_type in (NodeType.DEPTH, NodeType.IMAGE, NodeType.IR):
+                fields = BEGIN_FIELDS.pack(UNKNOWN_COUNT, LATEST_TIME)
+                self._append(pack_record(Kind.DATA_BEGIN, number, fields))
+
+    def add_frame(self, node: int, timestamp_us: int, payload: bytes) -> None:
+        """Add the next frame of a node."""
+        entries = self._entries[node]
+        previous = entries[-1][2] if entries else 0
+        fields = FRAME_FIELDS.pack(timestamp_us, len(entries) + 1)
+        offset = self._append(pack_record(Kind.NEW_DATA, node, fields, payload, previous))
+        entries.append((timestamp_us, 0, offset))
+        self._latest_us = max(self._latest_us, timestamp_us)
+
+    def close(self) -> None:
+        """Finish the file. Harmless when called twice."""
+        if self._file.closed:
+            return
+        try:
+            with self._saying():
+                self._finish()
+                self._file.flush()
+        finally:
+            self._file.close()
+
+    def discard(self) -> None:
+        """Close and remove the file."""
+        if not self._file.closed:
+            with suppress(OSError):
+                self._file.close()
+            self.path.unlink(missing_ok=True)
+
+    def _finish(self) -> None:
+        additions = []
+        for number, node in self._nodes.items():
+            start = self._node_offsets[number]
+            self._append(pack_record(Kind.NODE_REMOVED, number, undone_offset=start))
+            entries = self._entries[number]
+            table = b"".join(SEEK_ENTRY.pack(*entry) for entry in [(0, 0, 0), *entries])
+            table_offset = 0
+            if entries and len(table) <= MAX_PAYLOAD:  # longer, OpenNI2 refuses; it may be missing
+                table_offset = self._append(pack_record(Kind.SEEK_TABLE, number, payload=table))
+            counted = NodeAddition(
+                node.name, node.node_type, node.codec, len(entries), table_offset
+            )
+            latest_us = entries[-1][0] if entries else 0
+            additions.append((start, number, pack_addition(counted, latest_us, table_offset)))
+        self._append(pack_record(Kind.END, 0))
+        for start, number, fields in additions:
+            self._file.seek(start)
+            self._file.write(pack_record(Kind.NODE_ADDED, number, fields))
+        self._file.seek(0)
+        self._file.write(self._header(self._latest_us))
+
+    def _header(self, latest_us: int) -> bytes:
+        highest = max(self._nodes, default=1)
+        return FILE_HEADER.pack(IDENTITY, *VERSION, latest_us, highest)
+
+    def _append(self, data: bytes) -> int:
+        offset = self._offset
+        with self._saying():
+            self._file.write(data)
+        self._offset += len(data)
+        return offset
+
+    @contextmanager
+    def _saying(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self.discard()
+            raise self._failed(error) from error
+
+    def _failed(self, error: OSError) -> OutputError:
+        return OutputError(
+            f"'{self.path}' cannot be written ({error.strerror}); check the folder, its permissions"
+            " and the free space."
+        )
+
+
+class OniWriter:
+    """Writes depth frames to an .oni file that OpenNI2 replays bit by bit.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; must not exist.
+    fps : float, default 30
+        Nominal frame rate; the format stores it as a whole number.
+
+    Raises
+    ------
+    OutputError
+        If the file exists or cannot be written.
+
+    Notes
+    -----
+    The format stores fields of view, not principal points: a camera that does not look through
+    the middle of its image comes back as one that does.
+    """
+
+    def __init__(self, path: str | Path, *, fps: float = _DEFAULT_FPS) -> None:
+        self._fps = fps
+        self._camera: Camera | None = None
+        self._first_us = 0
+        self._writer = RecordWriter(Path(path))
+
+    def write(self, frame: DepthFrame) -> None:
+        """Add a frame. Timestamps are stored as the time since the first.
+
+        Raises
+        ------
+        ValueError
+            If the frame's camera differs from the first frame's, it is too large for OpenNI2, or
+            its timestamp lies before the first.
+        OutputError
+            If it cannot be written, as on a full disk.
+        """
+        if self._camera is None:
+            self._begin(frame)
+        elif frame.camera != self._camera:
+            raise ValueError(
+                f"frame {frame.index} has {frame.camera}, but '{self._writer.path}' is of"
+                f" {self._camera}; write it to another file"
+            )
+        since_us = frame.timestamp_us - self._first_us
+        if since_us < 0:
+            raise ValueError(
+                f"frame {frame.index} is {-since_us} us older than the first; frames must be in"
+                " the order of their time"
+            )
+        self._writer.add_frame(1, since_us, encode_depth(frame.depth_mm))
+
+    def close(self) -> None:
+        """Finish the file; without a frame there is none."""
+        if self._camera is None:
+            self._writer.discard()
+        self._writer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _begin(self, frame: DepthFrame) -> None:
+        camera = frame.camera
+        if 2 * camera.width * camera.height > MAX_PAYLOAD:
+            raise ValueError(
+                f"frames of {camera.width}x{camera.height} pixels are too large for an .oni file;"
+                " write a folder of PNG frames"
+            )
+        self._camera = camera
+        self._first_us = frame.timestamp_us
+        depth = NodeAddition("Depth", NodeType.DEPTH, CODEC_TABLE, None, 0)
+        self._writer.add_node(1, depth, depth_properties(camera, self._fps))
+        self._writer.begin()
+
+
+def write_oni(path: str | Path, frames: Iterable[DepthFrame], *, fps: float | None = None) -> int:
+    """Save frames as an .oni file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; must not exist.
+    frames : iterable of DepthFrame
+        All of one camera; an open `DepthSource` is one.
+    fps : float, optional
+        Nominal frame rate; default that of the source, or 30.
+
+    Returns
+    -------
+    int
+        Number of frames written.
+
+    Raises
+    ------
+    OutputError
+        If the file exists or cannot be written.
+    """
+    if fps is None:
+        fps = frames.fps if isinstance(frames, DepthSource) else _DEFAULT_FPS
+    count = 0
+    with OniWriter(path, fps=fps) as recording:
+        for frame in frames:
+            recording.write(frame)
+            count += 1
+    return count
+
+
+def depth_properties(camera: Camera, fps: float) -> dict[str, Property]:
+    """What OpenNI2 wants to know of a depth stream, under the names that its recorder uses."""
+    width, height = camera.width, camera.height
+    whole_fps = min(max(round(fps), 1), 1000)
+    fov_x_rad = 2 * math.atan(width / (2 * camera.fx))
+    fov_y_rad = 2 * math.atan(height / (2 * camera.fy))
+    return {
+        "oniRequiredFrameSize": integer(2 * width * height),
+        "xnIsGenerating": integer(1),
+        "xnDeviceMaxDepth": integer(_MAX_DEPTH_MM),
+        "xnSupportedMapOutputModesCount": integer(1),
+        "xnSupportedMapOutputModes": structure("<III", width, height, whole_fps),
+        "xnMapOutputMode": structure("<III", width, height, whole_fps),
+        "xnPixelFormat": integer(_GREY_16_BIT),
+        "oniPixelFormat": integer(_DEPTH_1_MM),
+        "xnFOV": structure("<dd", fov_x_rad, fov_y_rad),
+        "Cropping": integer(1),
+        # Without this one OpenNI2 opens the file but delivers no frame.
+        "xnCropping": structure("<IHHHH", 0, 0, 0, 0, 0),
+        "Mirror": integer(1),
+        "xnMirror": integer(0),
+    }

@@ -1,0 +1,340 @@
+"""A live sensor through OpenNI2, watched over and brought back when it goes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import asdict, dataclass, replace
+
+from selective_depth.drivers.errors import (
+    DeviceLostError,
+    DeviceRefusedError,
+    SourceEndedError,
+    SourceError,
+    SourceNotFoundError,
+    SourceTimeoutError,
+)
+from selective_depth.drivers.frame import DepthArray, DepthFrame
+from selective_depth.drivers.openni.process import Message, Worker, camera_of, error_of
+from selective_depth.drivers.openni.sensors import DeviceInfo
+from selective_depth.drivers.source import DepthSource
+
+_OPEN_S = 10.0  # a sensor that loads its firmware takes seconds
+_REOPEN_S = 4.0  # when it comes back; longer if it took longer the first time
+_STALL_S = 1.0  # silence after which the sensor counts as stalled
+_RESTART_S = 3.0  # silence after which it is opened afresh
+_HANG_S = 2.0  # the worker says something every 0.2 s; beyond this it hangs
+_MISFITS = 15  # so many wrong frames in a row, and the sensor is set up afresh
+_BACK_OFF_S = (0.2, 0.4, 0.8, 1.5)  # pauses between attempts, the last one for ever
+_GRACE_S = 1.0  # for a worker to stop the sensor before it is killed
+_BEAT_S = 0.1  # how soon the supervisor notices that it should end
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceSettings:
+    """How a live sensor is set up, and set up again whenever it comes back.
+
+    Parameters
+    ----------
+    width, height : int, default 640, 480
+        Size of its depth image, in pixels.
+    fps : int, default 30
+        Its frame rate.
+    mirror : bool, default False
+        Deliver the image as in a mirror.
+    registration : bool, default False
+        Depth registered to the sensor's colour camera, where it can.
+    """
+
+    width: int = 640
+    height: int = 480
+    fps: int = 30
+    mirror: bool = False
+    registration: bool = False
+
+
+class _Count:
+    """Numbers and timestamps that go on rising when the sensor starts its own again."""
+
+    def __init__(self) -> None:
+        self._number = -1
+        self._timestamp_us = 0
+        self._seen_s = time.monotonic()
+        self._add_number = 0
+        self._add_us = 0
+        self._fresh = True
+
+    def restart(self) -> None:
+        """The next frame is the first of another run of the sensor."""
+        self._fresh = True
+
+    def follow(self, message: Message) -> tuple[int, int]:
+        """Number and timestamp of a frame in the life of this source."""
+        index, timestamp_us = int(message["index"]), int(message["timestamp_us"])
+        now = time.monotonic()
+        renumbered = self._fresh or index + self._add_number <= self._number
+        if renumbered:
+            self._add_number = self._number + 1 - index
+        turned_back = renumbered and timestamp_us + self._add_us <= self._timestamp_us
+        if self._number >= 0 and (self._fresh or turned_back):
+            # The outage takes as long on our clock as it took on the wall.
+            away_us = round((now - self._seen_s) * 1e6)
+            self._add_us = self._timestamp_us + max(away_us, 1) - timestamp_us
+        self._fresh = False
+        self._seen_s = now
+        self._number = index + self._add_number
+        self._timestamp_us = timestamp_us + self._add_us
+        return self._number, self._timestamp_us
+
+
+class OpenNIDevice(DepthSource):
+    """A live depth sensor: the newest frame wins.
+
+    A supervisor thread takes the frames in and notices what OpenNI2 does not report. It opens
+    the sensor again with the same settings, for as long as it takes, with pauses that grow to
+    1.5 s; `state` tells how it stands, and `read` raises a named error meanwhile.
+
+    ======================  =======================================================
+    no frame for 1 s        ``"stalled"``; after 3 s it is opened afresh
+    unplugged               ``"lost"`` until there is a sensor of its kind again
+    driver crashes          ``"reconnecting"``
+    driver hangs for 2 s    ``"reconnecting"``; its process is killed
+    frames of a wrong size  thrown away; after 15 in a row ``"reconnecting"``
+    ======================  =======================================================
+
+    Parameters
+    ----------
+    device_uri : str, default ""
+        Which sensor; empty for the only one.
+    settings : DeviceSettings, optional
+        Default 640x480 at 30 fps, not mirrored, not registered.
+
+    Attributes
+    ----------
+    device : DeviceInfo
+        The sensor that was opened.
+    state : str
+        ``"live"``, ``"stalled"``, ``"lost"`` or ``"reconnecting"``.
+    state_reason : str
+        Why, in a few words; empty while live.
+    restarts : int
+        How often the sensor has been brought back.
+    misfits : int
+        Frames of the wrong size or format that were thrown away.
+
+    Raises
+    ------
+    RuntimeMissingError
+        If OpenNI2 is not installed.
+    SourceNotFoundError
+        If there is no such sensor, or there are several and none is named.
+    DeviceRefusedError
+        If it is there but busy, not permitted, without the wanted mode, or does not start.
+    """
+
+    live = True
+    frame_count = None
+    device: DeviceInfo
+
+    def __init__(self, device_uri: str = "", settings: DeviceSettings | None = None) -> None:
+        self.uri = f"openni:{device_uri}" if device_uri else "openni"
+        self.settings = settings or DeviceSettings()
+        self.dropped = 0
+        self.restarts = 0
+        self.misfits = 0
+        self.state_reason = ""
+        self._wanted_uri = device_uri
+        self._changed = threading.Condition()
+        self._closing = threading.Event()
+        self._newest: tuple[DepthArray, int, int] | None = None
+        self._failure: BaseException | None = None
+        self._first_number = 0
+        self._next_number: int | None = None
+        self._count = _Count()
+        self._attempts = 0
+        started = time.monotonic()
+        self._worker, about = self._open(_OPEN_S, None)
+        self._reopen_s = max(_REOPEN_S, 2 * (time.monotonic() - started))
+        camera = camera_of(about)
+        if self.settings.mirror:
+            camera = replace(camera, cx=camera.width - 1 - camera.cx)
+        self.camera = camera
+        self.fps = float(about["fps"])
+        self._supervisor = threading.Thread(
+            target=self._supervise, name="openni-supervisor", daemon=True
+        )
+        self._supervisor.start()
+
+    def read(self, timeout_s: float = 5.0) -> DepthFrame:
+        """Return the newest frame that has not been read, waiting for one if need be.
+
+        Parameters
+        ----------
+        timeout_s : float, default 5.0
+            How long to wait at most.
+
+        Raises
+        ------
+        SourceTimeoutError
+            If the sensor is there but gave nothing in time.
+        DeviceLostError
+            If it is not there. It is still looked for: read again to wait on.
+        SourceEndedError
+            If the source has been closed.
+        """
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._newest or self._failure or self._closing.is_set(), timeout_s
+            )
+            if self._closing.is_set():
+                raise SourceEndedError(f"{self.uri} has been closed.")
+            if self._failure is not None:
+                raise self._failure
+            if self._newest is None:
+                raise self._absence(timeout_s)
+            (depth_mm, number, timestamp_us), self._newest = self._newest, None
+        if self._next_number is None:
+            self._first_number = self._next_number = number
+        self.dropped += number - self._next_number
+        self._next_number = number + 1
+        return DepthFrame(
+            depth_mm=depth_mm,
+            index=number - self._first_number,
+            timestamp_us=timestamp_us,
+            camera=self.camera,
+            source=self.uri,
+        )
+
+    def close(self) -> None:
+        """Stop the sensor and release it. Harmless when called twice."""
+        self._closing.set()
+        with self._changed:
+            self._changed.notify_all()
+        self._supervisor.join()
+
+    def _absence(self, timeout_s: float) -> SourceError:
+        """The error for a frame that did not come."""
+        if self.state in ("lost", "reconnecting"):
+            return DeviceLostError(
+                f"The sensor {self.uri} is {self.state}: {self.state_reason}. It is opened again"
+                " as soon as it is there."
+            )
+        advice = " Check its cable and its power supply." if self.state == "stalled" else ""
+        return SourceTimeoutError(
+            f"The sensor {self.uri} gave no frame within {timeout_s:g} s.{advice}"
+        )
+
+    def _become(self, state: str, why: str = "") -> None:
+        with self._changed:
+            self.state, self.state_reason = state, why
+
+    def _open(self, timeout_s: float, known: DeviceInfo | None) -> tuple[Worker, Message]:
+        """Start a worker on the sensor and wait until it streams.
+
+        A sensor that is known may have come back under another address.
+        """
+        worker = Worker(
+            "device",
+            uri=self._wanted_uri,
+            like=asdict(known) if known else None,
+            settings=asdict(self.settings),
+        )
+        try:
+            deadline = time.monotonic() + timeout_s
+            while not self._closing.is_set():
+                message = worker.receive(min(deadline - time.monotonic(), _BEAT_S))
+                if message is None:
+                    if time.monotonic() > deadline:
+                        raise DeviceRefusedError(
+                            f"The sensor {self.uri} does not open: OpenNI2 hangs for"
+                            f" {timeout_s:g} s. Pull it out and plug it in again."
+                        )
+                elif message["kind"] == "found":
+                    self.device = DeviceInfo(**message["device"])
+                    if self.state == "lost":
+                        self._become("reconnecting", "it is there again")
+                elif message["kind"] == "opened":
+                    return worker, message
+                elif message["kind"] == "error":
+                    raise error_of(message)
+                elif message["kind"] == "died":
+                    raise DeviceRefusedError(
+                        f"The sensor {self.uri} does not open: {message['reason']}."
+                    )
+            raise SourceEndedError(f"{self.uri} has been closed.")
+        except BaseException:
+            worker.close()
+            raise
+
+    def _supervise(self) -> None:
+        try:
+            while not self._closing.is_set():
+                state, why = self._follow()
+                self._become(state, why)
+                self._worker.close(_GRACE_S)
+                self._reopen()
+        except BaseException as error:  # noqa: BLE001 - a reader must hear of it, whatever it is
+            with self._changed:
+                self._failure = error
+                self._changed.notify_all()
+        finally:
+            self._worker.close()
+
+    def _follow(self) -> tuple[str, str]:
+        """Take frames in until something is wrong; return the new state and the reason."""
+        misfits = unheard = 0
+        while not self._closing.is_set():
+            message = self._worker.receive(_BEAT_S)
+            # Beats, not the clock: if this process was held up, it is not the worker's fault.
+            unheard = unheard + 1 if message is None else 0
+            if message is None:
+                if unheard * _BEAT_S > _HANG_S:
+                    self._worker.close()  # at once: it would not stop the sensor any more
+                    return "reconnecting", "OpenNI2 hangs"
+            elif message["kind"] == "frame":
+                misfits = 0
+                self._arrive(message)
+            elif message["kind"] == "misfit":
+                misfits += 1
+                self.misfits += 1
+                if misfits >= _MISFITS:
+                    why = f"{misfits} wrong frames in a row; the last: {message['problem']}"
+                    return "reconnecting", why
+            elif message["kind"] == "idle":
+                if message["silent_s"] > _RESTART_S:
+                    return "reconnecting", f"no frame for {_RESTART_S:g} s"
+                if message["silent_s"] > _STALL_S:
+                    self._become("stalled", "it sends no frames")
+            elif message["kind"] == "lost":
+                return "lost", "it was unplugged or lost its power"
+            elif message["kind"] == "died":
+                return "reconnecting", message["reason"]
+            elif message["kind"] == "error":
+                return "reconnecting", message["message"].rstrip(".")
+        return "lost", "closed"
+
+    def _arrive(self, message: Message) -> None:
+        depth_mm = self._worker.take(message, self.camera.width, self.camera.height)
+        if self.settings.mirror:
+            depth_mm = depth_mm[:, ::-1]
+        number, timestamp_us = self._count.follow(message)
+        self._attempts = 0
+        with self._changed:
+            self.state, self.state_reason = "live", ""
+            self._newest = depth_mm, number, timestamp_us
+            self._changed.notify_all()
+
+    def _reopen(self) -> None:
+        """Open the sensor again, trying for as long as it takes."""
+        while not self._closing.wait(_BACK_OFF_S[min(self._attempts, len(_BACK_OFF_S) - 1)]):
+            self._attempts += 1
+            try:
+                self._worker, _ = self._open(self._reopen_s, self.device)
+            except SourceNotFoundError as error:
+                self._become("lost", str(error).rstrip("."))
+            except SourceError as error:
+                self._become("reconnecting", str(error).rstrip("."))
+            else:
+                self.restarts += 1
+                self._count.restart()
+                return

@@ -1,0 +1,185 @@
+"""The parent's side of the process that owns OpenNI2."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import mmap
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import uuid
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from selective_depth.drivers.errors import SourceError
+from selective_depth.drivers.frame import Camera, DepthArray
+from selective_depth.drivers.openni.runtime import find_runtime
+from selective_depth.drivers.openni.usb import usb_advice
+
+Message = dict[str, Any]
+"""What the worker says; its ``kind`` tells what else is in it."""
+
+_SLOTS = 4
+_SLOT_BYTES = 1280 * 1024 * 2  # more than any sensor of this kind has; unused pages cost none
+_ERRORS = {kind.__name__: kind for kind in SourceError.__subclasses__()}
+
+
+def error_of(message: Message) -> SourceError:
+    """The named error that an ``error`` message stands for."""
+    text = str(message["message"])
+    if message["remedy"]:
+        text += " " + (usb_advice(find_runtime().drivers) or message["remedy"])
+    return _ERRORS[message["error"]](text)
+
+
+def camera_of(stream: Message) -> Camera:
+    """Intrinsics of a stream from its fields of view; a Kinect's where it does not know them."""
+    size = int(stream["width"]), int(stream["height"])
+    fov_rad = float(stream["fov_x_rad"]), float(stream["fov_y_rad"])
+    if all(0 < angle < math.pi for angle in fov_rad):
+        return Camera.from_fov(*size, *fov_rad)
+    return Camera.kinect(*size)
+
+
+class Worker:
+    """One worker process, at one job.
+
+    Nothing of it can outlive this process: its memory has no name in the file system, and it
+    ends when its standard input does, which the system sees to whichever way we end.
+
+    Parameters
+    ----------
+    job : str
+        ``"list"``, ``"device"``, ``"recording"`` or ``"record"``.
+    keep_open : tuple of int, optional
+        File descriptors that the worker needs.
+    **values
+        The job's own parameters, as `openni_worker` reads them.
+
+    Raises
+    ------
+    RuntimeMissingError
+        If OpenNI2 is not installed.
+    """
+
+    def __init__(self, job: str, *, keep_open: tuple[int, ...] = (), **values: object) -> None:
+        runtime = find_runtime()
+        self._memory, name, descriptors = _anonymous_memory(_SLOTS * _SLOT_BYTES)
+        noisy = bool(os.environ.get("SELECTIVE_DEPTH_DEBUG"))
+        try:
+            self._process = subprocess.Popen(
+                # -P: the current folder must not offer modules to a process of ours.
+                [sys.executable, "-P", str(Path(__file__).with_name("worker.py"))],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=None if noisy else subprocess.DEVNULL,
+                pass_fds=(*descriptors, *keep_open),
+                **_own_group(),
+            )
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+        self._inbox: queue.SimpleQueue[Message] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, name="openni-reader", daemon=True)
+        self._reader.start()
+        start = {
+            "job": job,
+            "library": str(runtime.path),
+            "memory": name,
+            "slots": _SLOTS,
+            "slot_bytes": _SLOT_BYTES,
+            **values,
+        }
+        self._tell(json.dumps(start))
+
+    @property
+    def pid(self) -> int:
+        """Process number, for tests and messages."""
+        return self._process.pid
+
+    def receive(self, timeout_s: float) -> Message | None:
+        """The next message, or None if none comes in time.
+
+        After the worker's death this is ``{"kind": "died", "reason": …}``, once.
+        """
+        try:
+            return self._inbox.get(timeout=max(timeout_s, 0))
+        except queue.Empty:
+            return None
+
+    def take(self, frame: Message, width: int, height: int) -> DepthArray:
+        """Copy a ``frame`` message's image out of the shared memory and free its slot."""
+        pixels = np.frombuffer(
+            self._memory, np.uint16, width * height, offset=frame["slot"] * _SLOT_BYTES
+        )
+        image = pixels.reshape(height, width).copy()
+        self._tell(f"free {frame['slot']}")
+        return image
+
+    def stop(self) -> None:
+        """Ask the worker to finish its job; its last messages still come."""
+        self._tell("stop")
+
+    def close(self, grace_s: float = 0.0) -> None:
+        """End the process: let it finish for so long, then kill it. Harmless when called twice."""
+        with contextlib.suppress(OSError):
+            assert self._process.stdin is not None
+            self._process.stdin.close()
+        try:
+            self._process.wait(grace_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reader.join()
+        self._memory.close()
+
+    def _tell(self, line: str) -> None:
+        # A worker that died is noticed by its last message, not here.
+        with contextlib.suppress(OSError, ValueError):
+            assert self._process.stdin is not None
+            self._process.stdin.write(line.encode() + b"\n")
+            self._process.stdin.flush()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as answers:
+            for line in answers:
+                if line.endswith(b"\n"):  # else it died while writing it
+                    self._inbox.put(json.loads(line))
+        self._inbox.put({"kind": "died", "reason": _death(self._process.wait())})
+
+
+def _death(code: int) -> str:
+    if code < 0:
+        with contextlib.suppress(ValueError):
+            return f"OpenNI2 crashed ({signal.Signals(-code).name})"
+    return f"the OpenNI2 process ended with code {code}"
+
+
+def _own_group() -> dict[str, Any]:
+    # Ctrl-C in a terminal goes to a whole process group; the worker must not see it.
+    if sys.platform == "win32":
+        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    return {"process_group": 0}
+
+
+def _anonymous_memory(size: int) -> tuple[mmap.mmap, int | str, tuple[int, ...]]:
+    """Memory to share with a child: the map, how the child finds it, descriptors to pass on."""
+    if sys.platform == "win32":
+        name = f"selective-depth-{uuid.uuid4()}"
+        return mmap.mmap(-1, size, tagname=name), name, ()
+    if sys.platform == "linux":
+        descriptor = os.memfd_create("selective-depth")
+    else:
+        with tempfile.TemporaryFile() as file:
+            descriptor = os.dup(file.fileno())
+    os.ftruncate(descriptor, size)
+    return mmap.mmap(descriptor, size), descriptor, (descriptor,)

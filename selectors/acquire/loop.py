@@ -1,0 +1,183 @@
+"""Spending a budget of measurements over rounds, where the model is likely to be wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from selective_depth.selectors.acquire.refinement import finer_lattice
+from selective_depth.selectors.acquire.scores import Score, StepScore
+from selective_depth.selectors.reconstruct import reconstruct
+from selective_depth.selectors.samples import Samples
+from selective_depth.selectors.seeds import SeedGrid
+
+Measure = Callable[[npt.NDArray[np.int32]], npt.NDArray[np.generic]]
+"""A random-access depth sensor: pixels (n, 2), column first, to depth (n,) in mm, 0 = none."""
+
+MOST_ROUNDS = 254
+"""Rounds are counted in a byte, and an image of them needs one value for "never"."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """What one round of an acquisition did.
+
+    Parameters
+    ----------
+    shots : int
+        Measurements made.
+    returned : int
+        Those that returned depth.
+    """
+
+    shots: int
+    returned: int
+
+
+@dataclass(frozen=True, eq=False)
+class Acquisition:
+    """The multi-resolution model: the seeds and every shot added to them.
+
+    Parameters
+    ----------
+    uv : int32 array of shape (n, 2)
+        Pixels measured, column first, in the order of measuring; seeds first.
+    depth_mm : uint16 array of shape (n,)
+        Depth; 0 = no return (kept: it was paid for, and it marks a hole). float32 if the sensor
+        answers in floats, or in numbers beyond 65,535.
+    round : uint8 array of shape (n,)
+        Round in which each was measured, 0 = seed.
+    frame_shape : tuple of int
+        Height and width of the frame in pixels.
+    rounds : tuple of Round
+        Summary of each round after the seeds.
+    """
+
+    uv: npt.NDArray[np.int32]
+    depth_mm: npt.NDArray[np.uint16] | npt.NDArray[np.float32]
+    round: npt.NDArray[np.uint8]
+    frame_shape: tuple[int, int]
+    rounds: tuple[Round, ...]
+
+    @property
+    def returned(self) -> npt.NDArray[np.bool_]:
+        """Which measurements returned depth, shape (n,)."""
+        return self.depth_mm > 0
+
+    def round_image(self) -> npt.NDArray[np.uint8]:
+        """Round in which each pixel was measured, plus one; 0 = never; shape (H, W)."""
+        image = np.zeros(self.frame_shape, np.uint8)
+        image[self.uv[:, 1], self.uv[:, 0]] = self.round + 1
+        return image
+
+    def mask(self, number: int | None = None) -> npt.NDArray[np.bool_]:
+        """Pixels shot in a round (0 = the seeds), or in all rounds after the seeds."""
+        chosen = self.round > 0 if number is None else self.round == number
+        mask = np.zeros(self.frame_shape, np.bool_)
+        mask[self.uv[chosen, 1], self.uv[chosen, 0]] = True
+        return mask
+
+    def reconstruct(self, threads: int | None = None) -> npt.NDArray[np.float32]:
+        """Dense depth of the model in millimetres, shape (H, W)."""
+        return reconstruct(self.uv, self.depth_mm, self.frame_shape, threads=threads)
+
+
+def shots_of(budget: float, shape: tuple[int, int]) -> int:
+    """Number of measurements in a budget: an int is a number, a float a share of the pixels."""
+    pixels = shape[0] * shape[1]
+    shots = budget if isinstance(budget, int | np.integer) else budget * pixels
+    if not 0 <= shots <= pixels:  # NaN is not either
+        raise ValueError(
+            f"a budget of {budget} is {shots:g} of {pixels} pixels; give a share from 0.0 to 1.0,"
+            " or a whole number of measurements"
+        )
+    return round(float(shots))
+
+
+def _shares(shots: int, rounds: int, first: int) -> list[int]:
+    """Shots made at the end of each round: all rounds alike, or all after a first that is given."""
+    given = [first] if first else []
+    count = rounds - len(given)
+    return given + [first + (shots - first) * (n + 1) // count for n in range(count)]
+
+
+def _fits_16_bits(depth_mm: npt.NDArray[np.float32]) -> bool:
+    return bool(depth_mm.max(initial=0) <= np.iinfo(np.uint16).max)
+
+
+def acquire(
+    measure: Measure,
+    seeds: SeedGrid,
+    budget: float = 0.05,
+    rounds: int = 8,
+    selector: Score | None = None,
+    *,
+    threads: int | None = None,
+) -> Acquisition:
+    """Measure where the model is likely to be wrong, round by round.
+
+    Parameters
+    ----------
+    measure : callable
+        The sensor: pixels (n, 2), column first, to depth (n,) in millimetres; 0, negative or
+        not finite = no return.
+        It is asked for nothing but the chosen pixels, each at most once.
+    seeds : SeedGrid
+        The first measurements; they are not part of the budget.
+    budget : float or int, default 0.05
+        Float: share of the frame's pixels. Int: number of measurements. A measurement that
+        returns nothing is paid for as well.
+    rounds : int, default 8
+        In how many rounds; 1 decides everything from the seeds. Where these are few and far
+        apart, the first of several rounds makes their lattice finer (`finer_lattice`).
+    selector : Score, optional
+        What a shot is worth; default `StepScore`.
+    threads : int, optional
+        Kernel threads; default `default_threads()`.
+
+    Returns
+    -------
+    Acquisition
+        Seeds and shots. It may hold fewer shots than the budget, if there was nothing left
+        near any sample.
+    """
+    if not 1 <= rounds <= MOST_ROUNDS:
+        raise ValueError(f"{rounds} rounds were asked for; give between 1 and {MOST_ROUNDS}")
+    score = StepScore() if selector is None else selector
+    shots = shots_of(budget, seeds.frame_shape)
+    even_uv, pitch_px = finer_lattice(seeds, shots if rounds > 1 else 0)
+    samples = Samples.of(seeds, pitch_px)
+    plan = score.plan(samples, threads)
+    lattice_uv = seeds.lattice_uv.reshape(-1, 2)
+    lattice_mm = seeds.depth_mm.ravel()
+    uv, depth = [lattice_uv], [lattice_mm]
+    whole = _fits_16_bits(lattice_mm) and bool((lattice_mm % 1 == 0).all())
+    made: list[Round] = []
+    for due in _shares(shots, rounds, len(even_uv)):
+        spent = sum(r.shots for r in made)
+        new_uv = even_uv if len(even_uv) and not made else plan.best(due - spent)
+        answer = np.asarray(measure(new_uv))
+        new_mm = answer.astype(np.float32)
+        new_mm[~(np.isfinite(new_mm) & (new_mm > 0))] = 0
+        whole &= np.issubdtype(answer.dtype, np.integer) and _fits_16_bits(new_mm)
+        if new_mm.shape != (len(new_uv),):
+            raise ValueError(
+                f"the sensor was asked for {len(new_uv)} pixels and answered with shape"
+                f" {new_mm.shape}; it must return one depth per pixel"
+            )
+        samples.add(new_uv, new_mm)
+        uv.append(new_uv)
+        depth.append(new_mm)
+        made.append(Round(len(new_uv), int(np.count_nonzero(new_mm))))
+    counts = [len(part) for part in uv]
+    depth_mm: npt.NDArray[np.float32] = np.concatenate(depth)
+    return Acquisition(
+        np.concatenate(uv),
+        depth_mm.astype(np.uint16) if whole else depth_mm,
+        np.repeat(np.arange(len(uv), dtype=np.uint8), counts),
+        seeds.frame_shape,
+        tuple(made),
+    )

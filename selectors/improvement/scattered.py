@@ -1,0 +1,238 @@
+"""The improvement map of samples anywhere, and only where it is asked for.
+
+After a round of acquisition the samples are no lattice any more. The windows stay as they are
+(see `windows`): each now holds all the samples in its box, the nearest to its centre first. On
+a lattice alone that is the same system as `ImprovementSelector` solves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_over
+from selective_depth.selectors.improvement.systems import (
+    MAX_SAMPLES,
+    krige_window,
+    sample_buffers,
+    window_scratch,
+)
+from selective_depth.selectors.improvement.variogram import fit_samples
+from selective_depth.selectors.parallel import in_bands
+
+EXPONENT = 1.2
+"""The exponent w = 2 - epsilon of the semivariogram (eq. 24); see `app/docs/improvement.md`."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImprovementMap:
+    """Estimate, variance and improvement of a frame's pixels.
+
+    Parameters
+    ----------
+    estimate_mm : float32 array of shape (height, width)
+        Depth by ordinary kriging in millimetres, NaN where unknown or not asked for.
+    variance_mm2 : float32 array of shape (height, width)
+        Its kriging variance in mm^2, NaN where unknown or not asked for.
+    known : bool array of shape (height, width)
+        False where a pixel is too far from every sample, or was not asked for.
+    raw : float32 array of shape (height, width)
+        Improvement (eq. 23) in millimetres, 0 where unknown or not asked for.
+    """
+
+    estimate_mm: npt.NDArray[np.float32]
+    variance_mm2: npt.NDArray[np.float32]
+    known: npt.NDArray[np.bool_]
+    raw: npt.NDArray[np.float32]
+
+
+def improvement_scattered(
+    uv: npt.NDArray[np.integer],
+    depth_mm: npt.NDArray[np.generic],
+    shape: tuple[int, int],
+    where: npt.NDArray[np.bool_] | None = None,
+    *,
+    lattice: tuple[int, int] | None = None,
+    exponent: float = EXPONENT,
+    threads: int | None = None,
+) -> ImprovementMap:
+    """Map the improvement from samples at any pixels.
+
+    Parameters
+    ----------
+    uv : int array of shape (n, 2)
+        Pixels of the samples, column first. Of several at one pixel the last counts.
+    depth_mm : array of shape (n,)
+        Their depths in millimetres; 0, negative or not finite = no measurement.
+    shape : tuple of int
+        Height and width of the frame.
+    where : bool array of shape `shape`, optional
+        Pixels to map; default all. The cost follows the windows that these lie in.
+    lattice : tuple of int, optional
+        Rows and columns of the lattice of windows; default 128x128, or the frame's size where
+        that is less. With the seeds' own lattice, seeds alone give the seeds' map.
+    exponent : float, default 1.2
+        The w = 2 - epsilon of eq. (24), in (0, 2).
+    threads : int, optional
+        Kernel threads; default `default_threads()`. The result does not depend on it.
+
+    Raises
+    ------
+    ValueError
+        If a sample lies outside the frame or an array's shape is wrong.
+    """
+    height, width = shape
+    if uv.ndim != 2 or uv.shape[1] != 2 or depth_mm.shape != (len(uv),):
+        raise ValueError(
+            f"uv must have shape (n, 2) and depth_mm (n,), got {uv.shape} and {depth_mm.shape}"
+        )
+    if len(uv) and not (uv.min() >= 0 and uv[:, 0].max() < width and uv[:, 1].max() < height):
+        raise ValueError(f"a sample lies outside the frame of {width}x{height} pixels")
+    if where is not None and where.shape != shape:
+        raise ValueError(f"where must have the frame's shape {shape}, got {where.shape}")
+    measured = np.zeros(shape, np.float32)
+    depth = np.asarray(depth_mm, np.float32)
+    measured[uv[:, 1], uv[:, 0]] = np.where(np.isfinite(depth) & (depth > 0), depth, 0)
+    asked = np.ones(shape, np.bool_) if where is None else np.ascontiguousarray(where, np.bool_)
+    over = lattice or (min(128, height), min(128, width))
+    return _map(measured, asked, windows_over(shape, over, exponent), threads)
+
+
+def _map(
+    measured: npt.NDArray[np.float32],
+    asked: npt.NDArray[np.bool_],
+    windows: Windows,
+    threads: int | None,
+) -> ImprovementMap:
+    rows, columns = windows.rows, windows.columns
+    result = ImprovementMap(
+        estimate_mm=np.full(measured.shape, np.nan, np.float32),
+        variance_mm2=np.full(measured.shape, np.nan, np.float32),
+        known=np.zeros(measured.shape, np.bool_),
+        raw=np.zeros(measured.shape, np.float32),
+    )
+    spiral = _spiral(windows.power.shape[0] // 2)
+
+    def band(first_row: int, end_row: int) -> None:
+        _map_rows(
+            first_row, end_row, measured, asked,
+            rows.centres, rows.before, rows.after, columns.centres, columns.before, columns.after,
+            windows.power, spiral, windows.reach_px**2,
+            sample_buffers(), np.zeros((MAX_SAMPLES, windows.most_pixels), np.float32),
+            window_scratch(windows.most_pixels),
+            np.zeros((3, end_row - first_row, measured.shape[1]), np.float32),
+            np.zeros((end_row - first_row, measured.shape[1]), np.float32),
+            (result.estimate_mm, result.variance_mm2, result.raw, result.known),
+        )  # fmt: skip
+
+    in_bands(band, measured.shape[0], threads)
+    return result
+
+
+def _spiral(reach: int) -> npt.NDArray[np.int64]:
+    """Offsets (dv, du) up to `reach`, the nearest first; equals in a fixed order."""
+    steps = np.arange(-reach, reach + 1)
+    dv, du = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
+    order = np.lexsort((du, dv, dv * dv + du * du))
+    return np.stack((dv[order], du[order]), axis=1).astype(np.int64)
+
+
+@njit(cache=True, forceinline=True, nogil=True)
+def _gather(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
+    measured, spiral, row, column, up, down, left, right, samples
+):
+    """Collect the samples of a window's box, the nearest to its centre first."""
+    height, width = measured.shape
+    u, v, z, row_of = samples
+    count = 0
+    in_box = (up + down + 1) * (left + right + 1)
+    for n in range(len(spiral)):
+        dv, du = spiral[n]
+        if not (-up <= dv <= down and -left <= du <= right):
+            continue
+        in_box -= 1
+        y, x = row + dv, column + du
+        if 0 <= y < height and 0 <= x < width and measured[y, x] > 0:
+            u[count], v[count], z[count], row_of[count] = x, y, measured[y, x], count
+            count += 1
+        if count == len(u) or in_box == 0:
+            break
+    return count
+
+
+@njit(cache=True, forceinline=True, nogil=True)
+def _near_sample(measured, spiral, y, x, reach_squared):  # type: ignore[no-untyped-def] # pragma: no cover
+    height, width = measured.shape
+    for n in range(len(spiral)):
+        dv, du = spiral[n]
+        if dv * dv + du * du > reach_squared:
+            return False
+        if 0 <= y + dv < height and 0 <= x + du < width and measured[y + dv, x + du] > 0:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
+    first_row, end_row, measured, asked, rows, up, down, columns, left, right, power, spiral,
+    reach_squared, samples, distances, scratch, sums, held, out,
+):  # fmt: skip
+    estimate, variance, raw, known = out
+    u, v, z, row_of = samples
+    between = np.zeros((MAX_SAMPLES, MAX_SAMPLES))
+    reach = power.shape[0] // 2
+    frame_width = measured.shape[1]
+    for i in range(len(rows)):
+        top, bottom = rows[i] - up[i] + 1, rows[i] + down[i]
+        y0, y1 = max(top, first_row), min(bottom, end_row)
+        if y0 >= y1:
+            continue
+        for j in range(len(columns)):
+            start, end = columns[j] - left[j] + 1, columns[j] + right[j]
+            x0, x1 = max(start, 0), min(end, frame_width)
+            if not asked[y0:y1, x0:x1].any():
+                continue
+            count = _gather(
+                measured, spiral, rows[i], columns[j], up[i], down[i], left[j], right[j], samples
+            )
+            # One sample alone says nothing of how depth varies around it.
+            if count < 2:
+                continue
+            for n in range(count):
+                for k in range(count):
+                    between[n, k] = power[reach + v[n] - v[k], reach + u[n] - u[k]]
+            a, b = fit_samples(z, row_of, count, between)
+            width, height = end - start, bottom - top
+            for n in range(count):
+                p = 0
+                for y in range(top - 1, bottom + 1):
+                    line = power[reach + y - v[n]]
+                    for x in range(start - 1, end + 1):
+                        distances[n, p] = line[reach + x - u[n]]
+                        p += 1
+            krige_window(
+                samples, count, a, b, between, distances, 0, start, top, width, height,
+                measured.shape, scratch,
+            )  # fmt: skip
+            for y in range(y0, y1):
+                gap = up[i] if y < rows[i] else down[i]
+                share_y = count * (1.0 - abs(y - rows[i]) / gap)
+                for x in range(x0, x1):
+                    gap = left[j] if x < columns[j] else right[j]
+                    share = np.float32(share_y * (1.0 - abs(x - columns[j]) / gap))
+                    p = (y - top + 1) * (end - start + 2) + x - start + 1
+                    held[y - first_row, x] += share
+                    sums[0, y - first_row, x] += share * scratch[0][p]
+                    sums[1, y - first_row, x] += share * scratch[1][p]
+                    sums[2, y - first_row, x] += share * scratch[2][p]
+    for y in range(first_row, end_row):
+        for x in range(frame_width):
+            total = held[y - first_row, x]
+            if asked[y, x] and total > 0 and _near_sample(measured, spiral, y, x, reach_squared):
+                known[y, x] = True
+                estimate[y, x] = sums[0, y - first_row, x] / total
+                variance[y, x] = sums[1, y - first_row, x] / total
+                raw[y, x] = sums[2, y - first_row, x] / total

@@ -1,0 +1,162 @@
+"""The improvement map (section IV): where a measurement would most improve what is known.
+
+Seeds in, an `ImprovementSelection` out: for every pixel how much the variance-to-mean ratio of
+its neighbourhood falls if it were measured (eq. 13, 23), and beside it the kriging estimate and
+its variance. See `kriging` for the system, `windows` for how the systems are laid over a frame
+and `app/docs/improvement.md` for every choice that the paper leaves open.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from selective_depth.selectors.improvement.lattice import lattice_scratch
+from selective_depth.selectors.improvement.map import LEVELS, best_threshold, improvement_rows
+from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_of
+from selective_depth.selectors.improvement.scattered import EXPONENT
+from selective_depth.selectors.improvement.systems import (
+    aligned_zeros,
+    sample_buffers,
+    window_scratch,
+)
+from selective_depth.selectors.parallel import in_bands
+from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.selection import Selection
+
+HALF_SCORE = 5e-4
+"""Improvement, as a share of the mean depth of the seeds, that scores one half."""
+
+FloatMap = npt.NDArray[np.float32]
+BoolMap = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class ImprovementSelection(Selection):
+    """What the improvement map selected, and the dense estimate that it comes from.
+
+    Parameters
+    ----------
+    estimate_mm : float32 array of shape (height, width)
+        Depth by ordinary kriging in millimetres, NaN where unknown.
+    variance_mm2 : float32 array of shape (height, width)
+        Its kriging variance in mm^2, 0 at a seed, NaN where unknown.
+    known : bool array of shape (height, width)
+        False where a pixel is too far from every sample that returned depth.
+    raw : float32 array of shape (height, width)
+        The improvement itself (eq. 23) in millimetres (mm^2 of variance per mm of depth);
+        0 at a seed and where unknown. `score` orders pixels exactly as `raw` does.
+    """
+
+    estimate_mm: FloatMap
+    variance_mm2: FloatMap
+    known: BoolMap
+    raw: FloatMap
+
+
+class ImprovementSelector:
+    """Selects where a measurement would most improve the model of the scene.
+
+    Parameters
+    ----------
+    share : float, default 0.10
+        Share of the known pixels that the mask selects, 0..1.
+    exponent : float, default 1.2
+        The w = 2 - epsilon of eq. (24), in (0, 2).
+    threads : int, optional
+        Kernel threads; default `default_threads()`. The result does not depend on it.
+
+    Raises
+    ------
+    ValueError
+        If `share` or `exponent` is out of its range.
+    """
+
+    def __init__(
+        self, share: float = 0.10, exponent: float = EXPONENT, threads: int | None = None
+    ) -> None:
+        if not 0 <= share <= 1:
+            raise ValueError(f"share is {share}; it is a part of all pixels, 0..1")
+        if not 0 < exponent < 2:
+            raise ValueError(
+                f"exponent is {exponent}; a semivariogram a h^w needs 0 < w < 2 (the paper's"
+                " w = 2 makes singular systems)"
+            )
+        self.share = share
+        self.exponent = exponent
+        self.threads = threads
+
+    def select(self, seeds: SeedGrid) -> ImprovementSelection:
+        """Map the improvement over the whole frame and select its best pixels."""
+        windows = windows_of(seeds, self.exponent)
+        shape = seeds.frame_shape
+        # One block: the allocator keeps it for the next frame instead of returning its pages.
+        maps = np.empty((4, *shape), np.float32)
+        estimate, variance, raw, score = maps
+        known = np.empty(shape, np.bool_)
+        padded = np.zeros((seeds.shape[0] + 2, seeds.shape[1] + 2), np.float32)
+        padded[1:-1, 1:-1] = seeds.depth_mm
+        measured = np.count_nonzero(padded)
+        half = np.float32(HALF_SCORE * padded.sum(dtype=np.float64) / measured if measured else 1.0)
+        histograms: list[npt.NDArray[np.int32]] = []
+
+        def band(first_row: int, end_row: int) -> None:
+            histogram = np.zeros((2, LEVELS), np.int32)
+            histograms.extend(histogram)
+            improvement_rows(
+                first_row, end_row, padded, half, windows.kernel_arguments, _scratch(windows),
+                histogram, (estimate, variance, raw, score, known),
+            )  # fmt: skip
+
+        in_bands(band, shape[0], self.threads)
+        wanted = int(self.share * np.count_nonzero(known))
+        threshold = best_threshold(raw.ravel(), sum(histograms), wanted)
+        return ImprovementSelection(
+            mask=raw >= threshold,
+            score=score,
+            name="improvement",
+            estimate_mm=estimate,
+            variance_mm2=variance,
+            known=known,
+            raw=raw,
+        )
+
+
+class _Kept(threading.local):
+    """The working memory that a thread used last: frame after frame has the same lattice."""
+
+    windows: Windows | None = None
+    scratch: tuple[object, ...] = ()
+
+
+_kept = _Kept()
+
+
+def _scratch(windows: Windows) -> tuple[object, ...]:
+    """Working memory of `improvement_rows` for the calling thread."""
+    if _kept.windows is not windows:
+        _kept.scratch = _new_scratch(windows)
+        _kept.windows = windows
+    return _kept.scratch
+
+
+def _new_scratch(windows: Windows) -> tuple[object, ...]:
+    rows, columns = windows.rows, windows.columns
+    tallest = int((rows.before + rows.after).max()) - 1
+    widest = int((columns.before + columns.after).max()) - 1
+    places = windows.order[0].size
+    return (
+        sample_buffers(),
+        lattice_scratch(windows.most_pixels),
+        window_scratch(windows.most_pixels),
+        # A cache line more than needed: at a power of two, one lane's pixels would all be kept
+        # in the same few places of the cache.
+        aligned_zeros(2, 3, tallest, widest, places + 16),
+        aligned_zeros(2, places),
+        aligned_zeros(3, widest, places),
+        aligned_zeros(3, places),
+        np.zeros((2, len(columns.centres) + 1), np.int64),
+    )

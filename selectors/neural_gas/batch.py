@@ -1,0 +1,295 @@
+"""Neural gas in a few batch passes, cold or going on from the last frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from scipy.spatial import cKDTree
+
+from selective_depth.selectors.neural_gas.exact import draw_nodes
+from selective_depth.selectors.parallel import in_bands
+
+COLD_PASSES = 8
+"""Batch passes of a training from nothing, and of an update after the scene has changed."""
+LIVE_PASSES = 2
+"""Batch passes of an update from the last frame's nodes."""
+SETTLING_PASSES = 2
+"""How many of the last passes put no node elsewhere; at most half of them."""
+REHEAT_AT = 2.0
+"""The scene has changed where the quantisation error jumps by this factor between frames (the
+hand-held camera of the test sequence: 1.6 at most)."""
+GAIN = 0.3
+"""Share of its error that a node is expected to lose when a second one is put beside it."""
+
+_NODES_PER_BIN = 1.6
+_ENOUGH = 9  # nodes among which the two nearest are looked for, at least
+
+
+class BatchNeuralGas:
+    """Neural gas trained by batch passes whose winners are searched in nearby image bins.
+
+    A pass finds the nearest node of every seed among the nodes of the image bins around it,
+    then moves each node to the mean of the seeds it won: eq. (2) at the end of the annealing,
+    where only the winner moves, for all seeds at once. What the long annealing is for, nodes in
+    the right numbers everywhere, is done directly instead: nodes whose seeds would be served
+    almost as well by their neighbours are put beside nodes that serve theirs badly, as long as
+    that pays (the utility of Fritzke's LBG-U, 1997). Nodes left behind by a moving camera have
+    no utility at all, and nodes at newly seen surfaces large errors, so that the same rule keeps
+    a live training alive.
+
+    Parameters
+    ----------
+    nodes : int
+        Number of nodes N.
+    seed : int
+        Seed of the first draw; equal seeds give equal nodes, whatever `threads` is.
+    threads : int, optional
+        Threads of the search; default one per processor.
+
+    Attributes
+    ----------
+    nodes_mm_ : float32 array of shape (N, 3)
+        Nodes in space.
+    nodes_uv_ : float32 array of shape (N, 2)
+        Mean pixel (column, row) of the seeds each node won.
+    won_ : bool array of shape (N,)
+        Nodes that mean something for the last frame: those that won a seed, or were adopted.
+    quantisation_error_mm_ : float
+        Mean distance of the seeds of the last frame to their winners.
+    reheated_ : bool
+        Whether the last update took the passes of a cold training because the scene had changed.
+    """
+
+    nodes_mm_: npt.NDArray[np.float32]
+    nodes_uv_: npt.NDArray[np.float32]
+    won_: npt.NDArray[np.bool_]
+    quantisation_error_mm_: float
+    reheated_: bool
+
+    def __init__(self, nodes: int, seed: int, threads: int | None = None) -> None:
+        self._nodes = nodes
+        self._seed = seed
+        self._threads = threads
+
+    def train(self, points_mm: npt.NDArray[np.float32], uv: npt.NDArray[np.int32]) -> Self:
+        """Train from nothing.
+
+        Parameters
+        ----------
+        points_mm : float32 array of shape (M, 3)
+            Metric points of the seeds, all finite, at least one.
+        uv : int32 array of shape (M, 2)
+            Their pixels (column, row).
+        """
+        rng = np.random.default_rng(self._seed)
+        # One draw for both: a node begins with the place and the pixel of a seed.
+        both = np.concatenate((points_mm, uv), axis=1, dtype=np.float32)
+        first = draw_nodes(both, self._nodes, rng)
+        self.nodes_mm_ = np.ascontiguousarray(first[:, :3])
+        self.nodes_uv_ = np.ascontiguousarray(first[:, 3:])
+        self._pass(points_mm, uv, COLD_PASSES)
+        self.reheated_ = False
+        return self
+
+    def update(self, points_mm: npt.NDArray[np.float32], uv: npt.NDArray[np.int32]) -> Self:
+        """Go on from the last frame's nodes; the first update trains. Arguments as for `train`."""
+        if not hasattr(self, "nodes_mm_"):
+            return self.train(points_mm, uv)
+        self._pass(points_mm, uv, LIVE_PASSES, REHEAT_AT * self.quantisation_error_mm_)
+        return self
+
+    def adopt(
+        self,
+        nodes_mm: npt.NDArray[np.float32],
+        nodes_uv: npt.NDArray[np.float32],
+        points_mm: npt.NDArray[np.float32],
+    ) -> Self:
+        """Take over nodes trained otherwise, to go on from them.
+
+        Parameters
+        ----------
+        nodes_mm : float32 array of shape (N, 3)
+            Nodes in space.
+        nodes_uv : float32 array of shape (N, 2)
+            Nodes in the image.
+        points_mm : float32 array of shape (M, 3)
+            The points they were trained on, for the quantisation error.
+        """
+        self.nodes_mm_, self.nodes_uv_ = nodes_mm, nodes_uv.copy()
+        self.won_ = np.ones(len(nodes_mm), dtype=np.bool_)
+        distance, _ = cKDTree(nodes_mm).query(points_mm)
+        self.quantisation_error_mm_ = float(distance.mean())
+        self.reheated_ = False
+        return self
+
+    def _pass(
+        self,
+        points: npt.NDArray[np.float32],
+        pixels: npt.NDArray[np.int32],
+        passes: int,
+        most: float = math.inf,
+    ) -> None:
+        """Take batch passes; as many as from nothing if the error at first is above `most`."""
+        uv = pixels.astype(np.float32)
+        # Axis by axis: NumPy reduces an array this narrow along its length 20 times slower.
+        low = np.array([axis.min() for axis in uv.T])
+        size = np.array([axis.max() for axis in uv.T]) - low + 1
+        bin_px = max(1.0, math.sqrt(float(size[0] * size[1]) * _NODES_PER_BIN / self._nodes))
+        columns, rows = (int(n) for n in size // bin_px + 1)
+        uv -= low
+        self.nodes_uv_ -= low
+        winner = np.empty(len(points), dtype=np.int32)
+        d2 = np.empty((2, len(points)), dtype=np.float32)
+        find: Callable[..., None] = _find_two
+        done = 0
+        while True:
+            bins = _sort_into_bins(self.nodes_mm_, self.nodes_uv_, bin_px, rows, columns)
+            in_bands(
+                partial(find, points, uv, bin_px, rows, columns, *bins, winner, d2),
+                len(points),
+                self._threads,
+            )
+            if done == 0:
+                self.reheated_ = _mean_distance(d2[0]) > most
+                passes = COLD_PASSES if self.reheated_ else passes
+            if done == passes:
+                break
+            # The last passes settle the nodes that were put elsewhere.
+            relocate = done < passes - min(SETTLING_PASSES, passes // 2)
+            _move(points, uv, winner, d2, self.nodes_mm_, self.nodes_uv_, relocate)
+            done += 1
+        self.nodes_uv_ += low
+        self.won_ = np.zeros(self._nodes, dtype=np.bool_)
+        self.won_[winner] = True
+        self.quantisation_error_mm_ = _mean_distance(d2[0])
+
+
+def _mean_distance(d2: npt.NDArray[np.float32]) -> float:
+    return float(np.sqrt(d2).mean(dtype=np.float64))
+
+
+@njit(cache=True, nogil=True)
+def _sort_into_bins(nodes, nodes_uv, bin_px, rows, columns):  # type: ignore[no-untyped-def]
+    """Nodes ordered by image bin, as first index of each bin, node numbers and coordinates."""
+    count = len(nodes)
+    starts = np.zeros(rows * columns + 1, np.int32)
+    cell = np.empty(count, np.int32)
+    for i in range(count):
+        c = min(max(int(nodes_uv[i, 0] / bin_px), 0), columns - 1)
+        r = min(max(int(nodes_uv[i, 1] / bin_px), 0), rows - 1)
+        cell[i] = r * columns + c
+        starts[cell[i] + 1] += 1
+    for b in range(rows * columns):
+        starts[b + 1] += starts[b]
+    at = starts[:-1].copy()
+    number = np.empty(count, np.int32)
+    xyz = np.empty((3, count), np.float32)
+    for i in range(count):
+        j = at[cell[i]]
+        at[cell[i]] += 1
+        number[j] = i
+        for k in range(3):
+            xyz[k, j] = nodes[i, k]
+    return starts, number, xyz
+
+
+@njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz", "contract"})
+def _find_two(  # type: ignore[no-untyped-def]
+    points, uv, bin_px, rows, columns, starts, number, xyz, winner, d2, first, end
+):
+    """Winners of the seeds first..end among the bins around each; distances of the nearest two."""
+    sx, sy, sz = xyz[0], xyz[1], xyz[2]
+    far = np.float32(3e38)
+    per_px = np.float32(1 / bin_px)
+    for p in range(first, end):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        c = min(int(uv[p, 0] * per_px), columns - 1)
+        r = min(int(uv[p, 1] * per_px), rows - 1)
+        one, two, at = far, far, 0
+        met = 0
+        ring = 0
+        while met < _ENOUGH and ring < max(rows, columns):
+            ring += 1
+            one, two, at = far, far, 0
+            met = 0
+            left, right = max(c - ring, 0), min(c + ring, columns - 1)
+            for row in range(max(r - ring, 0), min(r + ring, rows - 1) + 1):
+                a = starts[row * columns + left]
+                b = starts[row * columns + right + 1]
+                met += b - a
+                for j in range(a, b):
+                    dx = sx[j] - x
+                    dy = sy[j] - y
+                    dz = sz[j] - z
+                    d = dx * dx + dy * dy + dz * dz
+                    # Choices, not branches: which node is nearer is not predictable.
+                    nearer = d < one
+                    loser = one if nearer else d
+                    two = loser if loser < two else two
+                    at = j if nearer else at
+                    one = d if nearer else one
+        winner[p] = number[at]
+        d2[0, p], d2[1, p] = one, two
+
+
+@njit(cache=True, nogil=True)
+def _move(points, uv, winner, d2, nodes, nodes_uv, relocate):  # type: ignore[no-untyped-def]
+    """Move nodes to the means of the seeds they won; relocate those that are of little use."""
+    count = len(nodes)
+    sums = np.zeros((count, 6), np.float32)
+    error = np.zeros(count, np.float32)
+    utility = np.zeros(count, np.float32)
+    worst = np.full(count, -1, np.int32)
+    for p in range(len(points)):
+        j = winner[p]
+        for k in range(3):
+            sums[j, k] += points[p, k]
+        for k in range(2):
+            sums[j, 3 + k] += uv[p, k]
+        sums[j, 5] += np.float32(1)
+        error[j] += d2[0, p]
+        utility[j] += d2[1, p] - d2[0, p]
+        if worst[j] < 0 or d2[0, p] > d2[0, worst[j]]:
+            worst[j] = p
+    for j in range(count):
+        if sums[j, 5] > 0:
+            share = np.float32(1) / sums[j, 5]
+            for k in range(3):
+                nodes[j, k] = sums[j, k] * share
+            for k in range(2):
+                nodes_uv[j, k] = sums[j, 3 + k] * share
+    if not relocate:
+        return
+    # As many nodes of the lowest utility as there are errors that outweigh them: the level at
+    # which the two counts meet, by bisection, needs no sorting.
+    low, high = np.float32(0), GAIN * error.max()
+    for _ in range(24):
+        level = np.float32(0.5) * (low + high)
+        useless = 0
+        needed = 0
+        for j in range(count):
+            useless += int(utility[j] < level)
+            needed += int(GAIN * error[j] > level)
+        if useless < needed:
+            low = level
+        else:
+            high = level
+    j = 0
+    for target in range(count):
+        if GAIN * error[target] > high:
+            while j < count and utility[j] >= high:
+                j += 1
+            if j == count:
+                return
+            p = worst[target]
+            for k in range(3):
+                nodes[j, k] = points[p, k]
+            for k in range(2):
+                nodes_uv[j, k] = uv[p, k]
+            j += 1

@@ -1,0 +1,467 @@
+"""The loop: every frame once, time kept, faults of the source survived or told."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from selective_depth.app.commands import run as session_module
+from selective_depth.app.commands.run import Session
+from selective_depth.app.console import interrupt
+from selective_depth.app.pipeline import Arrival, StageTimes, StateNote, Step, timing
+from selective_depth.app.pipeline.loop import MODEL_EVERY, Loop
+from selective_depth.app.settings import (
+    AcquireOptions,
+    GasOptions,
+    RunOptions,
+    SeedOptions,
+    Settings,
+    ViewerOptions,
+)
+from selective_depth.app.viewer import Viewer
+from selective_depth.drivers.errors import (
+    DamagedRecordingError,
+    DeviceLostError,
+    SourceEndedError,
+    SourceError,
+    SourceTimeoutError,
+)
+from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.realtime import RealtimeSource
+from selective_depth.drivers.source import DepthSource
+from selective_depth.selectors.acquire import Acquisition
+
+HEIGHT, WIDTH = 48, 64
+SMALL = Settings(
+    seeds=SeedOptions(24, 32),
+    gas=GasOptions(nodes=60),
+    viewer=ViewerOptions(headless=True),
+)
+
+
+def make_frame(index: int) -> DepthFrame:
+    depth_mm = np.full((HEIGHT, WIDTH), 2000, dtype=np.uint16)
+    depth_mm[:, WIDTH // 2 + index % 5 :] = 1200
+    depth_mm[10:14, 10:20] = 0
+    return DepthFrame(depth_mm, index, index * 33_333, Camera.kinect(WIDTH, HEIGHT), "made")
+
+
+class Script(DepthSource):
+    """A source that delivers frames and raises errors as it is told."""
+
+    def __init__(self, events: list[int | SourceError], *, live: bool = False) -> None:
+        self.uri = "script"
+        self.camera = Camera.kinect(WIDTH, HEIGHT)
+        self.fps = 30.0
+        self.live = live
+        self.frame_count = None if live else sum(isinstance(each, int) for each in events)
+        self.dropped = 0
+        self.closed = 0
+        self._events = iter(events)
+
+    def read(self, timeout_s: float = 5.0) -> DepthFrame:
+        event = next(self._events, SourceEndedError("the end"))
+        if isinstance(event, SourceError):
+            self.state = "lost" if isinstance(event, DeviceLostError) else "stalled"
+            raise event
+        self.state = "live"
+        return make_frame(event)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, source: DepthSource, settings: Settings = SMALL
+) -> tuple[int, Session]:
+    monkeypatch.setattr(session_module, "open_source", lambda uri: source)
+    session = Session("script", settings)
+    return session.run(), session
+
+
+@pytest.mark.parametrize("budget", [0.0, 0.05])
+def test_replay_takes_every_frame_once(monkeypatch: pytest.MonkeyPatch, budget: float) -> None:
+    source = Script(list(range(7)))
+    settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=budget, rounds=2))
+    code, session = run(monkeypatch, source, settings)
+    report = session.report
+    assert (code, report.frames, report.dropped, report.troubles) == (0, 7, 0, [])
+    assert source.closed == 1
+    expected = {"read", "seeds", "neural_gas", "improvement", "loop"}
+    assert set(report.stages) == expected | ({"acquire", "model"} if budget else set())
+    assert all(times.count == 7 for name, times in report.stages.items() if name != "read")
+    assert report.rmse_mm.count == (7 if budget else 0)
+    assert session.last is not None
+    assert session.last.frame.index == 6
+
+
+def test_frames_limits_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = dataclasses.replace(SMALL, run=RunOptions(frames=3))
+    code, session = run(monkeypatch, Script(list(range(7))), settings)
+    assert (code, session.report.frames) == (0, 3)
+
+
+def test_the_rate_is_that_of_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Script(list(range(8)))
+    plain, shown_s, rates = source.read, list[float](), list[float]()
+
+    def read(timeout_s: float = 5.0) -> DepthFrame:
+        time.sleep(0.1)
+        return plain(timeout_s)
+
+    def show(self: Viewer, item: Step | StateNote) -> None:
+        assert isinstance(item, Step)
+        shown_s.append(time.monotonic())
+        rates.append(item.figures["fps"])
+
+    monkeypatch.setattr(source, "read", read)
+    monkeypatch.setattr(Viewer, "show", show)
+    _, session = run(monkeypatch, source)
+    # The first is timed from when all was ready, which nobody sees from here.
+    began_s = shown_s[0] - 1 / rates[0]
+    for count, (at_s, rate) in enumerate(zip(shown_s, rates, strict=True), start=1):
+        assert rate == pytest.approx(count / (at_s - began_s), rel=0.1)
+    assert session.report.fps == pytest.approx(rates[-1], rel=0.1)
+
+
+def test_what_places_have_missed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Viewer, "dropped", {"viewer window": 3})
+    _, session = run(monkeypatch, Script([0, 1]))
+    assert session.report.missed == {"viewer window": 3}
+
+
+def test_a_lost_ctrl_c_ends_the_run_before_the_next_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Script(list(range(50)))
+    plain, asked = source.read, threading.Event()
+
+    def read(timeout_s: float = 5.0) -> DepthFrame:
+        frame = plain(timeout_s)
+        if frame.index == 2:
+            asked.set()  # and nothing was raised
+        return frame
+
+    monkeypatch.setattr(source, "read", read)
+    monkeypatch.setattr(interrupt, "_asked", asked)
+    code, session = run(monkeypatch, source)
+    assert code == 130
+    assert session.report.frames <= 3
+
+
+@pytest.mark.parametrize("window", [False, True])
+def test_a_picture_is_written_where_no_window_showed_the_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, window: bool
+) -> None:
+    class Shown(Viewer):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            self.window = window
+
+    monkeypatch.setattr(session_module, "Viewer", Shown)
+    viewer = ViewerOptions(headless=True, save=tmp_path / "out.rrd")
+    run(monkeypatch, Script([0, 1]), dataclasses.replace(SMALL, viewer=viewer))
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"out.rrd", "out.toml"} | ({"out.png"} if not window else set())
+
+
+def test_live_goes_on_through_stall_and_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    gone = [SourceTimeoutError("silent"), DeviceLostError("unplugged"), DeviceLostError("still")]
+    source = Script([0, 1, *gone, 2, 3], live=True)
+    code, session = run(monkeypatch, source)
+    assert (code, session.report.frames) == (0, 4)
+    assert session.report.live
+
+
+def test_the_report_tells_the_sensors_last_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Script([0, 1, DeviceLostError("unplugged")], live=True)
+
+    def read(
+        timeout_s: float = 5.0, plain: Callable[[float], DepthFrame] = source.read
+    ) -> DepthFrame:
+        if source.state == "lost":
+            raise KeyboardInterrupt
+        return plain(timeout_s)
+
+    monkeypatch.setattr(source, "read", read)
+    code, session = run(monkeypatch, source)
+    assert (code, session.report.frames, session.report.state) == (130, 2, "lost")
+
+
+def test_what_is_lost_while_starting_is_counted_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Script([0, 8, 9, 12], live=True)
+
+    def read(
+        timeout_s: float = 5.0, plain: Callable[[float], DepthFrame] = source.read
+    ) -> DepthFrame:
+        frame = plain(timeout_s)
+        source.dropped = {0: 0, 8: 7, 9: 7, 12: 9}[frame.index]
+        return frame
+
+    monkeypatch.setattr(source, "read", read)
+    _, session = run(monkeypatch, source)
+    assert (session.report.dropped_starting, session.report.dropped) == (7, 2)
+
+
+def test_a_live_loop_makes_the_model_of_some_frames_only() -> None:
+    settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, rounds=2))
+    with Loop(settings, realtime=True) as loop:
+        for index in range(3 * MODEL_EVERY):
+            loop.turn(make_frame(index))
+    assert 1 <= loop.times.summary()["model"].count <= 3
+
+
+ACQUIRING = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, rounds=2))
+
+
+def test_a_model_has_no_error_where_the_frame_has_no_depth() -> None:
+    with Loop(ACQUIRING) as loop:
+        step = loop.turn(make_frame(0))
+    assert step.model is not None
+    np.testing.assert_array_equal(np.isnan(step.model.error_mm), step.frame.depth_mm == 0)
+
+
+def test_a_live_model_is_handed_out_once() -> None:
+    with Loop(ACQUIRING, realtime=True) as loop:
+        assert loop.turn(make_frame(0)).model is None
+        assert loop._pending is not None
+        made = loop._pending.result()
+        later = [loop.turn(make_frame(index)).model for index in range(1, MODEL_EVERY)]
+    assert later == [made] + [None] * (MODEL_EVERY - 2)
+
+
+def test_stage_loop_holds_what_the_loop_itself_did(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Loop(SMALL) as loop:
+        loop.warm_up(make_frame(0))
+        train = loop._gas.update if loop._live_gas else loop._gas.select
+        # As slow as to outlast all that is done beside it.
+        monkeypatch.setattr(
+            loop._gas, train.__name__, lambda seeds: (time.sleep(0.1), train(seeds))[1]
+        )
+        loop.turn(make_frame(1))
+    stages = loop.times.summary()
+    assert stages["neural_gas"].max_ms >= 100
+    assert stages["loop"].max_ms >= stages["seeds"].max_ms + stages["neural_gas"].max_ms
+
+
+def test_a_step_has_the_times_of_its_own_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the next frame is under way when it is made."""
+    arrivals = [Arrival(make_frame(index), read_ms=float(index)) for index in range(6)]
+    with Loop(ACQUIRING) as loop:
+        loop.warm_up(make_frame(0))
+        select, calls = loop._improvement.select, itertools.count()
+        monkeypatch.setattr(
+            loop._improvement,
+            "select",
+            lambda seeds: (time.sleep(0.3 * (next(calls) == 3)), select(seeds))[1],
+        )
+        steps = list(loop.steps(arrivals))
+    assert [step.stages_ms["read"] for step in steps] == [0, 1, 2, 3, 4, 5]
+    assert max(range(6), key=lambda index: steps[index].stages_ms["improvement"]) == 3
+    own = {"read", "seeds", "neural_gas", "improvement", "acquire", "model", "loop"}
+    assert all(set(step.stages_ms) == own for step in steps)
+
+
+def test_starting_is_over_before_times_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = Acquisition.reconstruct
+
+    def slow(self: Acquisition, threads: int | None = None) -> npt.NDArray[np.float32]:
+        time.sleep(0.1)
+        return plain(self, threads)
+
+    monkeypatch.setattr(Acquisition, "reconstruct", slow)
+    with Loop(ACQUIRING, realtime=True) as loop:
+        loop.warm_up(make_frame(0))
+    assert loop.times.summary() == {}
+
+
+def test_a_closed_loop_leaves_no_thread() -> None:
+    before = set(threading.enumerate())
+    with Loop(ACQUIRING, realtime=True) as loop:
+        loop.turn(make_frame(0))
+    left = {thread.name for thread in set(threading.enumerate()) - before}
+    assert not [name for name in left if name.startswith(("beside", "model"))]
+
+
+@pytest.mark.parametrize(("budget", "realtime"), [(0.05, False), (0.05, True), (0.0, True)])
+def test_steps_come_in_order_and_none_is_held_back_from_silence(
+    budget: float, realtime: bool
+) -> None:
+    """Frames overlap; the steps are those of one frame at a time."""
+    settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=budget, rounds=2))
+    ahead: list[int] = []
+    taken = 0
+
+    def frames() -> Iterator[Arrival | None]:
+        for index in range(6):
+            yield Arrival(make_frame(index), f"state {index}")
+            ahead.append(index + 1 - taken)
+        yield None
+        assert taken == 6, "a step waits for a frame that does not come"
+        yield Arrival(make_frame(6), "state 6")
+
+    with Loop(settings, realtime=realtime) as loop, Loop(settings) as plain:
+        for index, step in enumerate(loop.steps(frames())):
+            taken += 1
+            expected = plain.turn(make_frame(index))
+            assert (step.frame.index, step.state) == (index, f"state {index}")
+            np.testing.assert_array_equal(step.regions.mask, expected.regions.mask)
+            np.testing.assert_array_equal(step.improvement.score, expected.improvement.score)
+            if step.acquisition is not None and expected.acquisition is not None:
+                np.testing.assert_array_equal(step.acquisition.uv, expected.acquisition.uv)
+    assert taken == 7
+    assert max(ahead) == (1 if budget or not realtime else 0)
+
+
+def test_damaged_recording_ends_with_what_was_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    damage = DamagedRecordingError("frame 3 of 'walk.oni' is damaged; use check --repair")
+    code, session = run(monkeypatch, Script([0, 1, 2, damage]))
+    assert (code, session.report.frames) == (1, 3)
+    assert session.report.troubles == [str(damage)]
+
+
+def test_replay_that_times_out_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SourceTimeoutError):
+        run(monkeypatch, Script([0, SourceTimeoutError("no frame within 5 s")]))
+
+
+def test_source_is_closed_when_a_selector_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Script([0, 1])
+    monkeypatch.setattr(Loop, "turn", lambda *_: (_ for _ in ()).throw(MemoryError("full")))
+    with pytest.raises(MemoryError):
+        run(monkeypatch, source)
+    assert source.closed == 1
+
+
+def test_saved_run_writes_settings_and_picture_beside(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    viewer = ViewerOptions(headless=True, save=tmp_path / "run.rrd")
+    code, session = run(monkeypatch, Script([0, 1]), dataclasses.replace(SMALL, viewer=viewer))
+    assert code == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"run.rrd", "run.toml", "run.png"}
+    assert set(session.report.written) == set(tmp_path.iterdir())
+
+
+def test_realtime_keeps_time_and_counts_what_nobody_read() -> None:
+    with RealtimeSource(Script(list(range(12)))) as source:
+        assert source.read().index == 0
+        time.sleep(0.2)
+        assert source.read().index == 1  # the clock starts here
+        time.sleep(0.2)
+        assert source.read().index >= 5  # frames come every 33 ms
+        seen = 3
+        while True:
+            try:
+                source.read()
+            except SourceEndedError:
+                break
+            seen += 1
+        assert seen + source.dropped == 12
+
+
+def test_realtime_passes_faults_on_and_bounds_its_wait() -> None:
+    with RealtimeSource(Script([0, DamagedRecordingError("damaged")])) as source:
+        assert source.read().index == 0
+        with pytest.raises(DamagedRecordingError):
+            source.read()
+    blocked = Script([0])
+    release = threading.Event()
+    blocked.read = lambda timeout_s=5.0: release.wait() and make_frame(0)  # type: ignore[method-assign,assignment]
+    with RealtimeSource(blocked) as source:
+        with pytest.raises(SourceTimeoutError, match=r"within 0\.1 s"):
+            source.read(0.1)
+        release.set()
+
+
+def test_realtime_passes_on_what_no_source_should_raise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    script = Script([0])
+
+    def read(timeout_s: float = 5.0) -> DepthFrame:
+        raise OSError("the disk is gone")
+
+    monkeypatch.setattr(script, "read", read)
+    with RealtimeSource(script) as source, pytest.raises(OSError, match="the disk is gone"):
+        source.read(2)
+    assert script.closed == 1
+
+
+def test_realtime_waits_for_a_reader_that_had_to_ask_often(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Reads that timed out before the first frame do not start the clock."""
+    script = Script(list(range(12)))
+    release, plain = threading.Event(), script.read
+
+    def read(timeout_s: float = 5.0) -> DepthFrame:
+        release.wait()
+        return plain(timeout_s)
+
+    monkeypatch.setattr(script, "read", read)
+    with RealtimeSource(script) as source:
+        for _ in range(3):
+            with pytest.raises(SourceTimeoutError):
+                source.read(0.01)
+        release.set()
+        assert source.read().index == 0
+        time.sleep(0.2)
+        assert source.read().index == 1
+        assert source.dropped == 0
+
+
+@given(st.lists(st.floats(0, 1e4, width=32), min_size=1, max_size=50))
+def test_stage_times_agree_with_numpy(durations_ms: list[float]) -> None:
+    times = StageTimes()
+    for each in durations_ms:
+        times.add("loop", each)
+    summary = times.summary()["loop"]
+    assert summary.count == len(durations_ms)
+    assert summary.max_ms == max(durations_ms)
+    expected = np.percentile(np.array(durations_ms, dtype=np.float32), (50, 99))
+    np.testing.assert_allclose((summary.p50_ms, summary.p99_ms), expected, rtol=1e-6)
+
+
+def test_stage_times_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(timing, "KEPT", 8)
+    times = StageTimes()
+    for each in [1000.0] + [1.0] * 100:
+        times.add("loop", each)
+    summary = times.summary()["loop"]
+    assert (summary.p50_ms, summary.p99_ms, summary.max_ms) == (1.0, 1.0, 1000.0)
+    assert summary.count == 101
+
+
+def test_failed_stage_is_not_counted() -> None:
+    times = StageTimes()
+    with pytest.raises(ValueError, match="bad"), times.stage("loop"):
+        raise ValueError("bad")
+    assert times.summary() == {}
+
+
+def test_without_a_display_the_run_is_saved(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(session_module, "has_display", lambda: False)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    settings = dataclasses.replace(SMALL, viewer=ViewerOptions())
+    code, _ = run(monkeypatch, Script([0, 1]), settings)
+    assert code == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "replay.rrd",
+        "replay.toml",
+        "replay.png",
+    }
+    assert "No display here" in capsys.readouterr().out

@@ -1,0 +1,580 @@
+"""The viewer: what is logged reads back exactly, and nobody ever waits for a dead one."""
+
+from __future__ import annotations
+
+import dataclasses
+import http.server
+import itertools
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from rerun_listener import Listener
+
+from selective_depth.app import cli
+from selective_depth.app.console.errors import UsageError, ViewerError
+from selective_depth.app.pictures import palette as legend
+from selective_depth.app.pipeline import STAGES, Model, StageTimes, StateNote, Step
+from selective_depth.app.settings import ViewerOptions
+from selective_depth.app.viewer import recording as viewer
+from selective_depth.app.viewer import sinks as places
+from selective_depth.drivers.errors import OutputError
+from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.selectors.acquire.loop import Acquisition, Round
+from selective_depth.selectors.improvement import ImprovementSelection
+from selective_depth.selectors.neural_gas import delaunay_regions
+from selective_depth.selectors.seeds import SeedGrid
+
+HEIGHT, WIDTH = 48, 64
+HEADLESS = ViewerOptions(headless=True)
+
+
+def make_step(index: int, *, acquiring: bool = True) -> Step:
+    """A small step with holes, made by hand: the viewer is tested, not the selectors."""
+    rng = np.random.default_rng(index)
+    depth_mm = rng.integers(600, 4000, (HEIGHT, WIDTH)).astype(np.uint16)
+    depth_mm[5:12, 20:30] = 0
+    camera = Camera.kinect(WIDTH, HEIGHT)
+    frame = DepthFrame(depth_mm, index, 1_000_000 + index * 33_333, camera, "made/by hand")
+    seeds = SeedGrid.from_frame(frame, (12, 16))
+    known = depth_mm > 0
+    score = np.where(known, rng.random((HEIGHT, WIDTH)), 0).astype(np.float32)
+    improvement = ImprovementSelection(
+        mask=score > 0.9,
+        score=score,
+        name="improvement",
+        estimate_mm=np.where(known, depth_mm, np.nan).astype(np.float32),
+        variance_mm2=np.where(known, 4.0, np.nan).astype(np.float32),
+        known=known,
+        raw=score,
+    )
+    regions = delaunay_regions(seeds.points_mm, seeds.uv.astype(np.float32), (HEIGHT, WIDTH))
+    acquisition = model = None
+    if acquiring:
+        uv = np.array([[3, 4], [25, 7], [50, 40]], dtype=np.int32)
+        acquisition = Acquisition(
+            uv=np.vstack((seeds.lattice_uv.reshape(-1, 2), uv)),
+            depth_mm=np.concatenate((seeds.depth_mm.ravel().astype(np.uint16), frame.measure(uv))),
+            round=np.array([0] * seeds.depth_mm.size + [1, 1, 2], dtype=np.uint8),
+            frame_shape=(HEIGHT, WIDTH),
+            rounds=(Round(2, 1), Round(1, 1)),
+        )
+        error_mm = np.where(known, 12.5, np.nan).astype(np.float32)
+        model = Model(depth_mm.astype(np.float32), error_mm, 12.5)
+    return Step(
+        frame,
+        seeds,
+        regions,
+        improvement,
+        acquisition,
+        model,
+        stages_ms=dict.fromkeys(STAGES, 1.0),
+        figures=dict.fromkeys(legend.FIGURES, 2.0),
+    )
+
+
+def save(path: Path, steps: list[Step], **options: Any) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=path, **options)
+    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=100)
+    for step in steps:
+        shown.show(step)
+    assert shown.close() == []
+    assert sum(shown.dropped.values()) == 0
+
+
+def rows_of(path: Path) -> dict[str, int]:
+    """Rows that carry data, by entity; static ones included."""
+    rows: dict[str, int] = {}
+    for chunk in RrdReader(str(path)).stream():
+        rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+    return rows
+
+
+def images_of(path: Path, entity: str, dtype: type[np.generic]) -> list[np.ndarray]:
+    """Images of an entity in the order of its frames, as they lie in the file."""
+    found = {}
+    for chunk in RrdReader(str(path)).stream():
+        if chunk.entity_path != entity or chunk.is_static:
+            continue
+        batch = chunk.to_record_batch()
+        buffer = next(n for n in batch.schema.names if n.endswith(":buffer"))
+        for frame, data in zip(
+            batch.column("frame").to_pylist(), batch.column(buffer), strict=True
+        ):
+            pixels = np.asarray(data.values.flatten())
+            found[frame] = pixels.view(dtype).reshape(HEIGHT, WIDTH)
+    return [found[frame] for frame in sorted(found)]
+
+
+def views_of(part: Any) -> list[Any]:
+    """All views in a blueprint."""
+    children = getattr(part, "contents", None) or []
+    if hasattr(part, "root_container"):
+        return views_of(part.root_container)
+    if hasattr(part, "class_identifier") or isinstance(children, str):
+        return [part]
+    return [view for child in children for view in views_of(child)]
+
+
+def test_file_holds_every_step_bit_for_bit(tmp_path: Path) -> None:
+    steps = [make_step(index) for index in range(12)]
+    save(tmp_path / "out.rrd", steps)
+    depths = images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)
+    masks = images_of(tmp_path / "out.rrd", "/camera/gas/mask", np.uint8)
+    maps = images_of(tmp_path / "out.rrd", "/camera/improvement/score", np.uint8)
+    assert len(depths) == len(masks) == len(maps) == len(steps)
+    for step, depth, mask, levels in zip(steps, depths, masks, maps, strict=True):
+        np.testing.assert_array_equal(depth, step.frame.depth_mm)
+        np.testing.assert_array_equal(mask != 0, step.regions.mask)
+        np.testing.assert_array_equal(levels != 0, step.improvement.known)
+        shown = (levels.astype(np.float32) - 1) / 254
+        known = step.improvement.known
+        assert np.abs(shown[known] - step.improvement.score[known]).max() <= 1 / 254
+
+
+@pytest.mark.parametrize("detail", [False, True])
+@pytest.mark.parametrize("acquiring", [False, True])
+def test_every_view_shows_something_that_was_logged(
+    tmp_path: Path, acquiring: bool, detail: bool
+) -> None:
+    save(tmp_path / "out.rrd", [make_step(0, acquiring=acquiring)], detail=detail)
+    logged = rows_of(tmp_path / "out.rrd")
+    views = views_of(viewer.blueprint(acquiring=acquiring, detail=detail))
+    assert len(views) >= (11 if acquiring else 8)
+    for view in views:
+        contents = view.contents
+        if isinstance(contents, str):
+            contents = [str(contents).replace("$origin", str(view.origin).rstrip("/"))]
+        for path in contents:
+            inside = [entity for entity in logged if entity.startswith(path.removesuffix("/**"))]
+            assert inside, f"view '{view.name}' shows {path}, which nobody logs"
+
+
+def test_sensor_state_is_logged_when_it_changes(tmp_path: Path) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=100)
+    shown.show(StateNote("lost"))  # before the first frame there is no time to log it at
+    shown.show(make_step(0))
+    for state in ("stalled", "stalled", "lost", "reconnecting"):
+        shown.show(StateNote(state))
+    shown.show(make_step(1))
+    assert shown.close() == []
+    states = []
+    for chunk in RrdReader(str(tmp_path / "out.rrd")).stream():
+        if chunk.entity_path == "/sensor/state" and not chunk.is_static:
+            column = chunk.to_record_batch().column("StateChange:state")
+            states += [value for row in column.to_pylist() for value in row]
+    assert states == ["replay", "stalled", "lost", "reconnecting", "replay"]
+
+
+def test_colour_limits_hold_for_the_whole_run(tmp_path: Path) -> None:
+    near, far = dataclasses.replace(HEADLESS, near_mm=700, far_mm=4200), make_step(1)
+    save(tmp_path / "out.rrd", [make_step(0), far], near_mm=near.near_mm, far_mm=near.far_mm)
+    ranges = set()
+    for chunk in RrdReader(str(tmp_path / "out.rrd")).stream():
+        if chunk.entity_path == "/camera/depth":
+            for row in chunk.to_record_batch().column("DepthImage:depth_range").to_pylist():
+                ranges.add(tuple(row[0]))
+    assert ranges == {(700.0, 4200.0)}
+
+
+@pytest.mark.parametrize("place", ["missing/out.rrd", ".", "/proc/out.rrd"])
+def test_unwritable_file_is_refused_at_once(tmp_path: Path, place: str) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / place)
+    with pytest.raises(OutputError, match="cannot be written"):
+        places.Viewer(chosen, live=False, times=StageTimes())
+
+
+def test_a_refused_run_leaves_an_older_file_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "old.rrd").write_bytes(b"precious")
+    chosen = dataclasses.replace(
+        HEADLESS, save=tmp_path / "old.rrd", connect="rerun+http://127.0.0.1:1/proxy"
+    )
+    with pytest.raises(ViewerError, match="no viewer listens"):
+        places.Viewer(chosen, live=False, times=StageTimes())
+    assert (tmp_path / "old.rrd").read_bytes() == b"precious"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX locks")
+def test_a_file_belongs_to_one_run_at_a_time(tmp_path: Path) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=2)
+    with pytest.raises(OutputError, match="another run is writing"):
+        places.Viewer(chosen, live=False, times=StageTimes())
+    shown.show(make_step(0))
+    assert shown.close() == []
+    assert len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)) == 1
+    places.Viewer(chosen, live=False, times=StageTimes()).close()
+
+
+def test_a_disk_that_is_nearly_full_is_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100 << 20))
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    with pytest.raises(OutputError, match="100 MiB are free there"):
+        places.Viewer(chosen, live=False, times=StageTimes())
+
+
+def test_full_disk_ends_the_file_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=100)
+    usage = shutil.disk_usage(tmp_path)
+    room = iter([1 << 30] * 3)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=next(room, 1 << 20)))
+    with pytest.raises(OutputError, match="disk is full"):
+        for index in range(100):
+            shown.show(make_step(index))
+    shown.close()
+    depths = images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)
+    assert len(depths) == 3
+    for index, depth in enumerate(depths):
+        np.testing.assert_array_equal(depth, make_step(index).frame.depth_mm)
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_a_recording_waits_for_its_file_and_a_sensor_for_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, live: bool
+) -> None:
+    go_on = threading.Event()
+    plain = viewer.Recording.log
+
+    def slow(self: viewer.Recording, item: Step | StateNote) -> None:
+        if live:
+            go_on.wait()
+        else:
+            time.sleep(0.05)
+        plain(self, item)
+
+    monkeypatch.setattr(viewer.Recording, "log", slow)
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    shown = places.Viewer(chosen, live=live, times=StageTimes(), frames=100)
+    for index in range(20):
+        shown.show(make_step(index))
+    dropped = sum(shown.dropped.values())
+    go_on.set()
+    assert shown.close() == []
+    saved = len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16))
+    assert (saved, dropped) == ((20 - dropped, 20 - saved) if live else (20, 0))
+    if live:
+        assert saved in (places.FILE_QUEUE, places.FILE_QUEUE + 1)  # and one in hand
+
+
+def test_a_write_that_fails_costs_no_more_than_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
+    monkeypatch.setattr(places, "CHECK_EVERY_S", 0.0)  # make sure after every step
+    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=2000)
+    plain, calls = viewer.Recording.flush, itertools.count()
+    sure: list[int] = []
+
+    def flush(self: viewer.Recording, timeout_s: float = 1e9) -> bool:
+        done = plain(self, timeout_s)
+        if next(calls) < 3:
+            sure.append((tmp_path / "out.rrd").stat().st_size)
+            return done
+        return False
+
+    monkeypatch.setattr(viewer.Recording, "flush", flush)
+    with pytest.raises(OutputError, match=r"failed after [\d,]+ bytes, which are kept"):
+        for index in range(100):
+            shown.show(make_step(index))
+    shown.close()
+    assert (tmp_path / "out.rrd").stat().st_size == sure[-1]
+    assert len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)) == 3
+
+
+@pytest.mark.parametrize(
+    "url", ["http://127.0.0.1:9876", "127.0.0.1:9876", "rerun+http:///proxy", "rubbish"]
+)
+def test_address_that_is_none_is_refused(url: str) -> None:
+    with pytest.raises(ViewerError, match="no viewer's address"):
+        places.Viewer(dataclasses.replace(HEADLESS, connect=url), live=True, times=StageTimes())
+
+
+def test_absent_viewer_is_noticed_at_once() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    chosen = dataclasses.replace(HEADLESS, connect=f"rerun+http://127.0.0.1:{port}/proxy")
+    start_s = time.monotonic()
+    with pytest.raises(ViewerError, match="no viewer listens"):
+        places.Viewer(chosen, live=True, times=StageTimes())
+    assert time.monotonic() - start_s < 2
+
+
+@pytest.mark.parametrize("address", ["9876", "localhost:", "localhost:99999", ":1"])
+def test_serve_address_is_checked(address: str) -> None:
+    chosen = dataclasses.replace(HEADLESS, serve=True, serve_address=address)
+    with pytest.raises(ViewerError, match="no address"):
+        places.Viewer(chosen, live=True, times=StageTimes())
+
+
+def test_taken_port_is_refused() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        chosen = dataclasses.replace(
+            HEADLESS, serve=True, serve_address=f"127.0.0.1:{taken.getsockname()[1]}"
+        )
+        with pytest.raises(ViewerError, match="cannot serve"):
+            places.Viewer(chosen, live=True, times=StageTimes())
+
+
+@pytest.fixture
+def listener() -> Iterator[Listener]:
+    made = Listener()
+    yield made
+    made.kill()
+
+
+def show_for(shown: places.Viewer, seconds: float, step: Step) -> tuple[int, float]:
+    """Show steps for a while; return how many and the longest time that one took."""
+    count, longest_s = 0, 0.0
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        start_s = time.monotonic()
+        shown.show(step)
+        longest_s = max(longest_s, time.monotonic() - start_s)
+        count += 1
+        time.sleep(0.01)
+    return count, longest_s
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no SIGSTOP on this system")
+def test_stalled_viewer_holds_up_nobody_and_spares_the_file(
+    listener: Listener, tmp_path: Path
+) -> None:
+    options = dataclasses.replace(listener.options, save=tmp_path / "out.rrd")
+    shown = places.Viewer(options, live=True, times=StageTimes(), frames=100)
+    step = make_step(0)
+    show_for(shown, 1.0, step)
+    before = shown.dropped
+    listener.process.send_signal(signal.SIGSTOP)
+    count, longest_s = show_for(shown, 1.5, step)
+    after = shown.dropped
+    file, remote = after
+    assert longest_s < 0.3
+    assert after[remote] - before[remote] > count / 2
+    assert after[file] - before[file] < count / 4  # a hundred a second is much for a busy machine
+    start_s = time.monotonic()
+    troubles = shown.close()
+    assert time.monotonic() - start_s < 3
+    assert len(troubles) == 1
+    assert "stalled" in troubles[0]
+    assert rows_of(tmp_path / "out.rrd")["/camera/depth"] > count / 2
+
+
+def test_killed_viewer_is_found_again_when_it_is_back(listener: Listener) -> None:
+    shown = places.Viewer(listener.options, live=True, times=StageTimes())
+    step = make_step(0)
+    show_for(shown, 1.0, step)
+    listener.kill()
+    count, longest_s = show_for(shown, 1.0, step)
+    lost = sum(shown.dropped.values())
+    assert longest_s < 0.3
+    assert lost > count / 2
+    listener.start()
+    show_for(shown, 2.5, step)
+    settled = sum(shown.dropped.values())
+    count, _ = show_for(shown, 0.5, step)
+    assert sum(shown.dropped.values()) - settled < count / 2
+    assert shown.close() == []
+
+
+def test_server_that_never_answers_ends_in_time() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        url = f"rerun+http://127.0.0.1:{mute.getsockname()[1]}/proxy"
+        options = dataclasses.replace(HEADLESS, connect=url)
+        shown = places.Viewer(options, live=True, times=StageTimes())
+        _, longest_s = show_for(shown, 0.5, make_step(0))
+        start_s = time.monotonic()
+        troubles = shown.close()
+    assert longest_s < 0.3
+    assert time.monotonic() - start_s < 3
+    assert "left behind" in troubles[0]
+
+
+def test_two_that_have_stalled_are_left_behind_in_the_time_of_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        port = int(mute.getsockname()[1])
+        monkeypatch.setattr(places, "has_display", lambda: True)
+        monkeypatch.setattr(places, "VIEWER_PORT", port)
+        options = ViewerOptions(connect=f"rerun+http://127.0.0.1:{port}/proxy")
+        shown = places.Viewer(options, live=True, times=StageTimes())
+        show_for(shown, 0.5, make_step(0))
+        start_s = time.monotonic()
+        troubles = shown.close()
+    assert len(troubles) == 2
+    assert time.monotonic() - start_s < 3
+
+
+def test_a_window_goes_beside_what_is_served(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(places, "listens", lambda address: True)
+    served = ViewerOptions(serve=True, serve_address=f"127.0.0.1:{places.VIEWER_PORT}")
+    elsewhere = ViewerOptions(serve=True, serve_address="127.0.0.1:1234")
+    for options, port in (
+        (ViewerOptions(), places.VIEWER_PORT),
+        (elsewhere, places.VIEWER_PORT),
+        (served, places.VIEWER_PORT + 1),
+    ):
+        assert f":{port}/" in places.WindowPlace(options, StageTimes()).url
+
+
+def test_two_places_see_the_same(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    options = dataclasses.replace(
+        HEADLESS, save=tmp_path / "out.rrd", serve=True, serve_address=address
+    )
+    shown = places.Viewer(options, live=False, times=StageTimes(), frames=100)
+    for index in range(5):
+        shown.show(make_step(index))
+    assert shown.close() == []
+    assert len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)) == 5
+
+
+def test_window_is_opened_and_used(monkeypatch: pytest.MonkeyPatch, listener: Listener) -> None:
+    opened: list[int] = []
+
+    def open_window(port: int, memory: str) -> None:
+        opened.append(port)
+        listener.start()
+
+    listener.kill()
+    monkeypatch.setattr(places, "has_display", lambda: True)
+    monkeypatch.setattr(places, "open_window", open_window)
+    monkeypatch.setattr(places, "VIEWER_PORT", listener.port)
+    for _ in range(2):  # the second run finds the window of the first
+        shown = places.Viewer(ViewerOptions(), live=False, times=StageTimes())
+        assert shown.window
+        shown.wait_ready()
+        for index in range(3):
+            shown.show(make_step(index))
+        assert shown.close() == []
+        assert shown.dropped == {"viewer window": 0}
+    assert opened == [listener.port]
+
+
+def picture_of(recording: Path, frame: int | None = None) -> np.ndarray:
+    """A screenshot; no other trouble than a missing graphics driver is a reason to skip."""
+    try:
+        return viewer.screenshot(recording, frame)
+    except ViewerError as error:
+        if "does not start" in str(error):
+            pytest.skip(f"no graphics driver: {error}")
+        raise
+
+
+def test_a_picture_shows_the_frame_that_was_asked_for(tmp_path: Path) -> None:
+    steps = []
+    for index, far in enumerate((1000, 3000, 3000)):
+        made = make_step(index)
+        flat_mm = np.full((HEIGHT, WIDTH), far, np.uint16)
+        frame = dataclasses.replace(made.frame, depth_mm=flat_mm)
+        steps.append(dataclasses.replace(made, frame=frame))
+    recording = tmp_path / "out.rrd"
+    save(recording, steps, near_mm=1000, far_mm=3000)
+    last, first = picture_of(recording), picture_of(recording, 0)
+    for picture, level in ((last, 255), (first, 0)):
+        view = picture[60:380, :540].reshape(-1, 3).astype(int)
+        blue, green, red = (
+            int(viewer.DEPTH_COLOURS[level]) >> shift & 255 for shift in (8, 16, 24)
+        )
+        like = np.abs(view - (blue, green, red)).max(axis=1) < 12
+        assert like.mean() > 0.3, "the frame's depth is not what is seen of the sensor"
+    with pytest.raises(UsageError, match=r"--frame is 3; the frames of .* are 0\.\.2"):
+        viewer.screenshot(recording, 3)
+
+
+def test_a_picture_of_a_recording_that_holds_nothing_is_refused(tmp_path: Path) -> None:
+    save(tmp_path / "out.rrd", [make_step(0)])
+    data = (tmp_path / "out.rrd").read_bytes()
+    (tmp_path / "cut.rrd").write_bytes(data[:1000])
+    with pytest.raises(ViewerError, match="finds nothing to show"):
+        picture_of(tmp_path / "cut.rrd")
+
+
+class SlowPage(http.server.BaseHTTPRequestHandler):
+    """A page with the web viewer in it that takes its time to load.
+
+    Chromium takes its picture when a page has loaded; the viewer is done long after that, so
+    the page waits for an image that comes late.
+    """
+
+    viewer_url = ""
+
+    def do_GET(self) -> None:
+        if self.path != "/":
+            time.sleep(40)
+        self.send_response(200 if self.path == "/" else 404)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+        if self.path == "/":
+            style = "position:fixed;inset:0;width:100%;height:100%;border:0"
+            page = f'<iframe src="{self.viewer_url}" style="{style}"></iframe><img src="/late.png">'
+            self.wfile.write(page.encode())
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        pass
+
+
+@pytest.mark.browser
+def test_web_viewer_shows_the_run(tmp_path: Path) -> None:
+    """To be looked at with one's own eyes; here only that it is neither empty nor failing."""
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    executable = viewer.viewer_executable()
+    if chromium is None or executable is None:
+        pytest.skip("no Chromium, or no web viewer in the SDK")
+    recording = tmp_path / "run.rrd"
+    picture = Path(os.environ.get("WEB_PICTURE", tmp_path / "web.png")).resolve()
+    source = os.environ.get("WEB_SOURCE", "virtual:workstation?frames=5")
+    budget = ["--budget", "0.05", "--rounds", "4"]
+    assert cli.run(["replay", source, "--headless", "--save", str(recording), *budget]) == 0
+    ports = []
+    for _ in range(2):
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            ports.append(free.getsockname()[1])
+    web, grpc = map(str, ports)
+    serving = [executable, str(recording), "--serve-web", "--bind", "127.0.0.1"]
+    server = subprocess.Popen(
+        [*serving, "--web-viewer-port", web, "--port", grpc],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    stream = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{grpc}%2Fproxy"
+    SlowPage.viewer_url = f"http://127.0.0.1:{web}/?url={stream}&renderer=webgl"
+    pages = http.server.ThreadingHTTPServer(("127.0.0.1", 0), SlowPage)
+    threading.Thread(target=pages.serve_forever, daemon=True).start()
+    try:
+        options = ["--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
+        options += ["--enable-unsafe-swiftshader", "--window-size=1920,1200", "--timeout=90000"]
+        address = f"http://127.0.0.1:{pages.server_port}/"
+        subprocess.run(
+            [chromium, *options, f"--user-data-dir={tmp_path}", f"--screenshot={picture}", address],
+            check=True,
+            timeout=240,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+    finally:
+        pages.shutdown()
+        server.kill()
+        server.wait()
+    image = cv2.imread(str(picture))
+    assert image.shape[1] == 1920
+    colourful = (image.max(axis=2) - image.min(axis=2)) > 60
+    assert colourful.mean() > 0.05, "the web viewer shows no depth, regions or map"
