@@ -9,7 +9,7 @@ from pathlib import Path
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.output import check_picture, is_picture, make_folder
 from selective_depth.app.pictures import StillRow, alone, contact_sheet, panels_of, write_picture
-from selective_depth.app.pipeline import Loop
+from selective_depth.app.pipeline import Pipeline
 from selective_depth.app.settings import PictureOptions, Settings
 from selective_depth.drivers.errors import SourceEndedError
 from selective_depth.drivers.frame import DepthFrame
@@ -46,9 +46,9 @@ def still_row(frame: DepthFrame, title: str, settings: Settings) -> StillRow:
     """Run both selectors, and the acquisition where there is a budget, on one frame."""
     # One frame has no frame before it to go on from.
     cold = replace(settings, gas=replace(settings.gas, training="cold"))
-    with Loop(cold) as loop:
-        step = loop.turn(frame)
-    return StillRow(title, frame, step.regions, step.improvement, step.acquisition)
+    with Pipeline(cold) as pipeline:
+        result = pipeline.make(frame)
+    return StillRow(title, frame, result.regions, result.improvement, result.acquisition)
 
 
 def snapshot(

@@ -25,7 +25,7 @@ from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError, ViewerError
 from selective_depth.app.console.output import cannot_write
 from selective_depth.app.pictures import palette as legend
-from selective_depth.app.pipeline import STAGES, StateNote, Step
+from selective_depth.app.pipeline import STAGES, FrameResult, SensorNote
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.frame import Camera, DepthFrame
@@ -70,7 +70,7 @@ class StepLogger:
         self._state = ""
         self._limits_mm = (0.0, 1.0)
 
-    def log(self, step: Step) -> None:
+    def log(self, step: FrameResult) -> None:
         """Log a step under its frame's number and time."""
         if self._start_us is None:
             self._start_us = step.frame.timestamp_us
@@ -109,7 +109,7 @@ class StepLogger:
             self._state = state
             self._stream.log("sensor/state", rr.StateChange(state=state))
 
-    def _log_static(self, step: Step) -> None:
+    def _log_static(self, step: FrameResult) -> None:
         camera, log, options = step.frame.camera, self._stream.log, self._options
         near, far = legend.depth_limits_mm(step.frame.depth_mm)
         near = near if options.near_mm is None else options.near_mm
@@ -161,7 +161,7 @@ class StepLogger:
         log("camera", rr.AnnotationContext([nothing, hole]), static=True)
         log("camera/gas", rr.AnnotationContext([nothing, kept, long]), static=True)
 
-    def _log_sensor(self, step: Step) -> None:
+    def _log_sensor(self, step: FrameResult) -> None:
         log, depth_mm, seeds = self._stream.log, step.frame.depth_mm, step.seeds
         log("camera/depth", self._depth_image(depth_mm))
         log("camera/holes", rr.SegmentationImage((depth_mm == 0).view(np.uint8), opacity=1.0))
@@ -191,7 +191,7 @@ class StepLogger:
         )
         log("world/regions", mesh)
 
-    def _log_improvement(self, step: Step) -> None:
+    def _log_improvement(self, step: FrameResult) -> None:
         log, improvement = self._stream.log, step.improvement
         known = improvement.known
         log("camera/improvement/score", _map_image(improvement.score, legend.IMPROVEMENT, known))
@@ -206,7 +206,7 @@ class StepLogger:
             image = _map_image(deviation_mm, legend.ERROR, known)
             log("camera/improvement/deviation", image)
 
-    def _log_acquisition(self, step: Step) -> None:
+    def _log_acquisition(self, step: FrameResult) -> None:
         log, acquisition = self._stream.log, step.acquisition
         if acquisition is None:
             return
@@ -225,9 +225,9 @@ class StepLogger:
             known = ~np.isnan(error_mm)
             log("camera/error", _map_image(error_mm, legend.ERROR, known))
 
-    def _log_figures(self, step: Step) -> None:
+    def _log_figures(self, step: FrameResult) -> None:
         log = self._stream.log
-        log("figures/stages", rr.Scalars(list(step.stages_ms.values())))
+        log("figures/stages", rr.Scalars([step.stages_ms.get(name, np.nan) for name in STAGES]))
         for name, value in step.figures.items():
             if np.isfinite(value):
                 log(f"figures/{name}", rr.Scalars(value))
@@ -488,9 +488,9 @@ class Recording:
         sink = rr.GrpcServerSink(host, port, server_memory_limit=options.serve_memory)
         return cls(sink, options)
 
-    def log(self, item: Step | StateNote) -> None:
+    def log(self, item: FrameResult | SensorNote) -> None:
         """Log a step, or the sensor's state."""
-        if isinstance(item, StateNote):
+        if isinstance(item, SensorNote):
             self._logger.log_state(item.state)
         else:
             self._logger.log(item)
