@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -11,6 +12,8 @@ import numpy.typing as npt
 
 Image = npt.NDArray[np.uint8]
 """Picture, shape (height, width, 3), red-green-blue."""
+Colourmap = Literal["viridis", "inferno", "plasma"]
+"""Called so in Rerun and OpenCV alike."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,7 @@ class Scale:
     quantity : str
         What it is of.
     colormap : str
-        Name of the colour map, in Rerun as in matplotlib and OpenCV.
+        Name of the colour map.
     limits : tuple of float
         Values at the dark and at the bright end; what lies beyond has the colour of the end.
     unit : str
@@ -30,7 +33,7 @@ class Scale:
     """
 
     quantity: str
-    colormap: str
+    colormap: Colourmap
     limits: tuple[float, float]
     unit: str = ""
 
@@ -40,13 +43,14 @@ class Scale:
         level = np.clip(
             np.rint((np.nan_to_num(values, nan=low) - low) * (255 / (high - low))), 0, 255
         )
-        return channels(palette(self.colormap))[level.astype(np.uint8)]
+        return np.asarray(channels(palette(self.colormap))[level.astype(np.uint8)])
 
 
 IMPROVEMENT = Scale("improvement", "inferno", (0.0, 1.0))
 ERROR = Scale("model error", "inferno", (0.0, 100.0), "mm")
 """Of the model as of the kriging deviation; larger errors share the brightest colour."""
-DEPTH_COLOURMAP, ROUND_COLOURMAP = "viridis", "plasma"
+DEPTH_COLOURMAP: Colourmap = "viridis"
+ROUND_COLOURMAP: Colourmap = "plasma"
 
 HOLE = 0x6F7480FF
 REGION = 0x26A69AA8
@@ -129,7 +133,7 @@ def backdrop_limits_mm(limits_mm: tuple[float, float]) -> tuple[float, float]:
 
 
 @cache
-def palette(colormap: str) -> npt.NDArray[np.uint32]:
+def palette(colormap: Colourmap) -> npt.NDArray[np.uint32]:
     """The 256 colours of a colour map, packed as 0xRRGGBBAA."""
     number = getattr(cv2, f"COLORMAP_{colormap.upper()}")
     levels = np.arange(256, dtype=np.uint8).reshape(-1, 1)

@@ -98,7 +98,7 @@ def draw_kept_triangles(axes: Axes, regions: RegionSelection) -> None:
     """Draw the outlines of the triangles that are kept."""
     from matplotlib.collections import PolyCollection
 
-    corners = regions.nodes_uv[regions.triangles[regions.kept]]
+    corners = list(regions.nodes_uv[regions.triangles[regions.kept]])
     edge = hexadecimal(palette.MESH)
     axes.add_collection(PolyCollection(corners, facecolors="none", edgecolors=edge, linewidths=0.4))
 

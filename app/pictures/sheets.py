@@ -10,7 +10,7 @@ import io
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from selective_depth.app.console.output import write_output
 from selective_depth.app.pictures import palette
@@ -125,10 +125,10 @@ def write_picture(path: Path, figure: Figure, dpi: int = DPI) -> None:
     """
     kind = path.suffix.lower().removeprefix(".")
     drawn = io.BytesIO()
-    options = {"pil_kwargs": {"quality": _WEBP_QUALITY}} if kind == "webp" else {}
+    encoding = {"quality": _WEBP_QUALITY} if kind == "webp" else None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a letter of some source's name that no font has
-        figure.savefig(drawn, format=kind, dpi=dpi, **options)
+        figure.savefig(drawn, format=kind, dpi=dpi, pil_kwargs=encoding)
     write_output(path, drawn.getvalue())
 
 
@@ -147,7 +147,7 @@ def _caption(axes: Axes, panel: Panel, each: float, tall: float, zoom: float) ->
     large, small = (13, 10) if each >= 3.5 else (11.5, 9)
     axes.text(0, 1 + 0.09 / tall, _told(panel.caption), transform=axes.transAxes,
               size=large * zoom, weight="bold", color=INK)  # fmt: skip
-    below = {"transform": axes.transAxes, "size": small * zoom, "color": PALE}
+    below: dict[str, Any] = {"transform": axes.transAxes, "size": small * zoom, "color": PALE}
     axes.text(1, -0.2 / tall, panel.note, ha="right", **below)
     if panel.scale is None:
         return
