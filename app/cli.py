@@ -260,10 +260,10 @@ def screenshot(
     frame : int
         The frame to show; by default the last.
     """
+    from selective_depth.app import viewer
     from selective_depth.app.console.output import IMAGES, check_picture, write_image
     from selective_depth.app.console.progress import waiting
     from selective_depth.app.pipeline import say
-    from selective_depth.app.viewer import recording as viewer
 
     check_picture(picture, IMAGES)
     with waiting("Loading it into the viewer"):
