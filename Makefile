@@ -26,7 +26,6 @@ $(VENV)/.tests-installed: pyproject.toml $(VENV)/.installed
 	@touch $@
 
 run: $(VENV)/.installed ## Replay the bundled recording: a viewer, or files where there is no display
-	@.ci/system-packages libopenni2-0 || echo "Going on without: the recording's PNG twin is replayed instead."
 	@$(BIN)/selective-depth replay --budget 0.05 --rounds 4
 
 test: $(VENV)/.tests-installed ## Run the whole suite (the long forms: make test-slow)

@@ -29,6 +29,7 @@ class RealtimeSource(DepthSource):
         self.camera = source.camera
         self.fps = source.fps
         self.frame_count = source.frame_count
+        self.notes = source.notes
         self.dropped = 0
         self._changed = threading.Condition()
         self._newest: DepthFrame | None = None

@@ -33,6 +33,8 @@ class DepthSource(ABC):
     state : str
         ``"live"``; a sensor that can fail also says ``"stalled"`` (there, but silent),
         ``"lost"`` (not there) or ``"reconnecting"`` (there again, being opened).
+    notes : tuple of str
+        What a user should know of it, a sentence each: what is missing, what was assumed.
     """
 
     uri: str
@@ -42,6 +44,7 @@ class DepthSource(ABC):
     live: bool
     dropped: int
     state: str = "live"
+    notes: tuple[str, ...] = ()
 
     @abstractmethod
     def read(self, timeout_s: float = 5.0) -> DepthFrame:

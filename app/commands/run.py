@@ -163,6 +163,7 @@ class Session:
                 source = stack.enter_context(RealtimeSource(source))
             report.live = source.live
             _tell(source)
+            report.troubles += source.notes
             pipeline = stack.enter_context(Pipeline(self.settings, realtime=source.live))
             frames = _frames_in_all(self.settings.run.frames, source.frame_count)
             viewer = self._open_viewer(pipeline, frames)
