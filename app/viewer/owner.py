@@ -41,7 +41,7 @@ def owner_of(port: int) -> Owner:
             links.add(f"socket:[{inode}]")
     for process in _PROC.glob("[0-9]*"):
         try:
-            if any(os.readlink(handle) in links for handle in (process / "fd").iterdir()):
+            if any(str(handle.readlink()) in links for handle in (process / "fd").iterdir()):
                 theirs = (process / "environ").read_bytes().split(b"\0")
                 program = (process / "exe").resolve()
                 return Owner(program, all(_same(name, theirs) for name in SCREENS))
