@@ -14,9 +14,8 @@ from pathlib import Path
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.output import write_picture
 from selective_depth.app.console.progress import FrameProgress, waiting
-from selective_depth.app.pictures.stills import StillRow, contact_sheet
+from selective_depth.app.pictures import StillRow, contact_sheet, write_picture
 from selective_depth.app.pipeline import (
     Feed,
     FrameResult,

@@ -90,8 +90,7 @@ def _image(name: str, *entities: str, over: rr.DepthImage | None = None) -> rrb.
 
 def _grey(limits_mm: tuple[float, float]) -> rr.DepthImage:
     """How depth looks below something else: dim, within a wider range."""
-    near, far = limits_mm
-    dim_range = [near - 0.3 * (far - near), far + 1.5 * (far - near)]
+    dim_range = list(legend.backdrop_limits_mm(limits_mm))
     return rr.DepthImage.from_fields(colormap="grayscale", depth_range=dim_range)
 
 

@@ -17,7 +17,7 @@ from selective_depth.app.viewer.blueprint import blueprint, epoch_blueprint
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.selectors.neural_gas import RegionSelection
 
-DEPTH_COLOURS = legend.palette(cv2.COLORMAP_VIRIDIS)
+DEPTH_COLOURS = legend.palette(legend.DEPTH_COLOURMAP)
 CENTRE = np.float32(0.5)
 """Rerun puts pixel centres at halves, we at whole numbers."""
 
@@ -125,7 +125,7 @@ class StepLogger:
     def _log_classes(self) -> None:
         log = self._stream.log
         nothing = (0, "", (0, 0, 0, 0))
-        hole = (1, "no measurement, or too far from one", legend.HOLE)
+        hole = (1, legend.UNKNOWN, legend.HOLE)
         kept, long = (1, "kept triangles", legend.REGION), (2, "long edges", legend.LONG_EDGE)
         # A class means what the nearest context above says: one for all, one for the regions.
         log("camera", rr.AnnotationContext([nothing, hole]), static=True)
@@ -164,7 +164,7 @@ class StepLogger:
     def _log_improvement(self, step: FrameResult) -> None:
         log, improvement = self._stream.log, step.improvement
         known = improvement.known
-        log("camera/improvement/score", _map_image(improvement.score, 1.0, known))
+        log("camera/improvement/score", _map_image(improvement.score, legend.IMPROVEMENT, known))
         log(
             "camera/improvement/unknown", rr.SegmentationImage((~known).view(np.uint8), opacity=1.0)
         )
@@ -173,7 +173,7 @@ class StepLogger:
                 "camera/improvement/estimate", self._depth_image(_as_depth(improvement.estimate_mm))
             )
             deviation_mm = np.sqrt(np.where(known, improvement.variance_mm2, 0))
-            image = _map_image(deviation_mm, legend.ERROR_LIMIT_MM, known)
+            image = _map_image(deviation_mm, legend.ERROR, known)
             log("camera/improvement/deviation", image)
 
     def _log_acquisition(self, step: FrameResult) -> None:
@@ -193,7 +193,7 @@ class StepLogger:
             log("camera/model", self._depth_image(_as_depth(step.model.depth_mm)))
             error_mm = step.model.error_mm
             known = ~np.isnan(error_mm)
-            log("camera/error", _map_image(error_mm, legend.ERROR_LIMIT_MM, known))
+            log("camera/error", _map_image(error_mm, legend.ERROR, known))
 
     def _log_figures(self, step: FrameResult) -> None:
         log = self._stream.log
@@ -204,7 +204,10 @@ class StepLogger:
 
     def _depth_image(self, depth_mm: npt.NDArray[np.uint16]) -> rr.DepthImage:
         return rr.DepthImage(
-            depth_mm, meter=1000.0, colormap="viridis", depth_range=list(self._limits_mm)
+            depth_mm,
+            meter=1000.0,
+            colormap=legend.DEPTH_COLOURMAP,
+            depth_range=list(self._limits_mm),
         )
 
 
@@ -219,13 +222,13 @@ def _as_depth(value_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
 
 
 def _map_image(
-    value: npt.NDArray[np.float32], limit: float, known: npt.NDArray[np.bool_]
+    value: npt.NDArray[np.float32], scale: legend.Scale, known: npt.NDArray[np.bool_]
 ) -> rr.DepthImage:
-    """Values of 0..limit as a coloured 8-bit image: 1..255, and 0 where nothing is known."""
+    """Values on a scale from 0 as a coloured 8-bit image: 1..255, and 0 where nothing is known."""
     # Saturates in one pass; what it makes of a NaN does not matter, that is nowhere known.
-    levels = np.asarray(cv2.convertScaleAbs(value, alpha=254 / limit, beta=1))
+    levels = np.asarray(cv2.convertScaleAbs(value, alpha=254 / scale.limits[1], beta=1))
     np.multiply(levels, known, out=levels)
-    return rr.DepthImage(levels, colormap="inferno", depth_range=[1.0, 255.0])
+    return rr.DepthImage(levels, colormap=scale.colormap, depth_range=[1.0, 255.0])
 
 
 def _closed_strips(points_uv: npt.NDArray[np.float32]) -> pa.Array:
