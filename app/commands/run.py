@@ -177,7 +177,7 @@ class Session:
             except KeyboardInterrupt:
                 self._code = INTERRUPTED
             finally:
-                report.troubles += viewer.close()
+                report.troubles += [*viewer.close(), *viewer.news()]
                 if viewer.file_failed and self._code == OK:
                     self._code = FAILED
                 report.missed = viewer.dropped

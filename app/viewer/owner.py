@@ -51,6 +51,6 @@ def owner_of(port: int) -> Owner:
 
 
 def _same(name: str, theirs: list[bytes]) -> bool:
-    ours = os.environ.get(name)
-    value = next((each for each in theirs if each.startswith(f"{name}=".encode())), None)
-    return value == (None if ours is None else f"{name}={ours}".encode())
+    start = f"{name}=".encode()
+    value = next((os.fsdecode(each[len(start) :]) for each in theirs if each.startswith(start)), "")
+    return value.removesuffix(".0") == os.environ.get(name, "").removesuffix(".0")

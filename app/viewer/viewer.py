@@ -212,7 +212,7 @@ class Viewer:
                 troubles.append(f"the {way.name} had stalled and was left behind.")
             elif way.failure is not None:
                 troubles.append(f"the {way.name} ended early: {way.failure}")
-        return self.news() + troubles
+        return troubles
 
 
 def _application(title: str, options: ViewerOptions) -> str:

@@ -70,6 +70,8 @@ class Window:
     ----------
     url : str
         Where it listens.
+    found : bool
+        Whether it was open already.
     awake : bool
         Whether it has answered; one that has not may still be opening, or never.
     notes : tuple of str
@@ -77,6 +79,7 @@ class Window:
     """
 
     url: str
+    found: bool
     awake: bool
     notes: tuple[str, ...] = ()
 
@@ -152,7 +155,7 @@ def get_window(options: ViewerOptions, taken: Container[int] = ()) -> Window:
     """
     ports = [port for port in PORTS if port not in taken]
     with ThreadPoolExecutor(len(ports)) as pool:
-        there = dict(zip(ports, pool.map(_look_at, ports), strict=True))
+        there = dict(zip(ports, pool.map(look_at, ports), strict=True))
     for port, listener in there.items():
         if listener is not None and listener.fits:
             default = ViewerOptions().viewer_memory
@@ -161,7 +164,7 @@ def get_window(options: ViewerOptions, taken: Container[int] = ()) -> Window:
                 " close it for --viewer-memory to count."
             )
             notes = (note,) * (options.viewer_memory != default)
-            return Window(local_url(port), awake=True, notes=notes)
+            return Window(local_url(port), found=True, awake=True, notes=notes)
     for port, listener in there.items():
         if listener is None:
             notes = tuple(
@@ -169,21 +172,22 @@ def get_window(options: ViewerOptions, taken: Container[int] = ()) -> Window:
                 for other, it in there.items()
                 if it is not None and other < port
             )
-            return Window(local_url(port), awake=_start(port, options), notes=notes)
+            return Window(local_url(port), False, _start(port, options), notes)
     raise ViewerError(
         f"the viewer window does not start: the ports {PORTS[0]}..{PORTS[-1]} all have other"
         " programs. End one, or use --save FILE.rrd --headless."
     )
 
 
-def _look_at(port: int) -> Listener | None:
+def look_at(port: int) -> Listener | None:
     """What is on a port of this machine; a viewer on another screen, or not ours, fits nobody."""
     listener = ask(local_url(port)) if listens(("127.0.0.1", port)) else None
     if listener is None or not (listener.viewer or listener.silent):
         return listener
     owner, ours = owner_of(port), viewer_executable()
     if not owner.same_screen:
-        return replace(listener, name=f"{listener.name} on another screen", fits=False)
+        where = " on another screen" * listener.viewer
+        return replace(listener, name=f"{listener.name}{where}", fits=False)
     # A viewer that paints for seconds does not answer; that it is of our version shows its file.
     busy = ours is not None and owner.program == Path(ours).resolve()
     return replace(listener, fits=listener.fits or (listener.silent and busy))
