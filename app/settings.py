@@ -70,7 +70,7 @@ Share = Annotated[float, must_be("a share between 0 and 1", float, lambda x: 0 <
 positive = must_be("more than 0", float, lambda x: 0 < x < float("inf"))
 Positive = Annotated[float, positive]
 TimeLimit = Annotated[float | None, positive, optional("SECONDS")]
-_SIZE = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%", re.IGNORECASE)
+_SIZE = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%")
 Memory = Annotated[
     str, must_be("a size, such as 256MiB or 25%", str, _SIZE.fullmatch), arg(metavar="SIZE")
 ]
@@ -149,14 +149,14 @@ class ViewerOptions:
     """Write everything to a Rerun recording, with the settings and a picture beside it."""
     serve: Flag = False
     """Serve a stream that viewers can join; a replay is served until Ctrl-C."""
-    serve_address: Annotated[str, arg(metavar="HOST:PORT")] = "127.0.0.1:9876"
-    """Where to serve it; the default lets only this machine in."""
+    serve_address: Annotated[str | None, optional("HOST:PORT")] = None
+    """Where to serve it; by default on this machine only, at 9876 or the next free port."""
     connect: Annotated[str | None, optional("URL")] = None
     """Send to a viewer that is already open, for example rerun+http://127.0.0.1:9876/proxy."""
     serve_memory: Memory = "256MiB"
-    """Memory of the served stream, for viewers that join late; then the oldest goes."""
+    """Memory of the stream, served or the window's, for those who join late; the oldest goes."""
     viewer_memory: Memory = "2GiB"
-    """Memory of the viewer window; then the oldest goes."""
+    """Memory of a viewer window that is opened; then the oldest goes."""
     near_mm: Millimetres = None
     """Depth at the dark end of the colour scale; by default what suits the first frame."""
     far_mm: Millimetres = None

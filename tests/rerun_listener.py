@@ -5,29 +5,38 @@ from __future__ import annotations
 import socket
 import subprocess
 import time
+from typing import Self
 
 from selective_depth.app.settings import ViewerOptions
-from selective_depth.app.viewer import recording, sinks
+from selective_depth.app.viewer import window
 
 
 class Listener:
-    """A Rerun server without a window, to be stopped, killed and started again."""
+    """A Rerun server without a window, to be stopped, killed and started again.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    follow : str, default ""
+        A served stream that it takes in, as a viewer that joins would.
+    """
+
+    def __init__(self, follow: str = "") -> None:
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = int(free.getsockname()[1])
+        self._follow = [follow] if follow else []
         self.process = self.start()
 
     def start(self) -> subprocess.Popen[bytes]:
-        executable = recording.viewer_executable()
+        executable = window.viewer_executable()
         assert executable is not None
+        serve = ["--serve-grpc", "--bind", "127.0.0.1", "--port", str(self.port)]
         self.process = subprocess.Popen(
-            [executable, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(self.port)],
+            [executable, *self._follow, *serve],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
         deadline_s = time.monotonic() + 10
-        while not sinks.listens(("127.0.0.1", self.port)):
+        while not window.listens(("127.0.0.1", self.port)):
             assert time.monotonic() < deadline_s, "the Rerun server did not start"
             time.sleep(0.02)
         return self.process
@@ -35,6 +44,12 @@ class Listener:
     def kill(self) -> None:
         self.process.kill()
         self.process.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.kill()
 
     @property
     def options(self) -> ViewerOptions:

@@ -28,9 +28,8 @@ from selective_depth.app.pipeline import (
     say,
     state_of,
 )
-from selective_depth.app.settings import Settings, ViewerOptions
-from selective_depth.app.viewer import Viewer, has_display
-from selective_depth.drivers.errors import OutputError
+from selective_depth.app.settings import Settings
+from selective_depth.app.viewer import Viewer, join_command
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.realtime import RealtimeSource
@@ -101,23 +100,6 @@ def _check_save(path: Path) -> None:
             )
 
 
-def _with_a_place(options: ViewerOptions, uri: str) -> ViewerOptions:
-    """Save to a file where nothing else was asked for and no window can be opened."""
-    asked = options.save or options.serve or options.connect or options.headless
-    if asked or has_display():
-        return options
-    path = Path("out", "live.rrd" if uri.startswith("openni") else "replay.rrd")
-    try:
-        path.parent.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"'{path}' cannot be written: {error.strerror}. Name another file with --save, or none"
-            " with --headless."
-        ) from None
-    say(f"No display here: saving to {path} instead; open it with 'rerun {path}'.")
-    return dataclasses.replace(options, save=path)
-
-
 class Session:
     """One run.
 
@@ -157,21 +139,19 @@ class Session:
         with ExitStack() as stack:
             with waiting(f"Opening {self._uri}"):
                 source = stack.enter_context(open_source(self._uri))
-            if self.settings.run.realtime and not source.live:
+            sensor = source.live
+            if self.settings.run.realtime and not sensor:
                 source = stack.enter_context(RealtimeSource(source))
             report.live = source.live
             _tell(source)
-            seen = _with_a_place(self.settings.viewer, self._uri)
-            self.settings = dataclasses.replace(self.settings, viewer=seen)
             pipeline = stack.enter_context(Pipeline(self.settings, realtime=source.live))
             frames = _frames_in_all(self.settings.run.frames, source.frame_count)
-            viewer = Viewer(seen, live=source.live, times=pipeline.times, frames=frames)
-            if seen.serve:
-                say(f"Serving on {seen.serve_address}; join with 'rerun {viewer.served_url}'.")
+            viewer = self._open_viewer(pipeline, frames)
+            seen = viewer.options
             try:
                 with interrupt.recognised(), FrameProgress(self._uri, frames) as progress:
                     self._flow(source, pipeline, viewer, progress)
-                if seen.serve and not report.live:
+                if viewer.served_url and not sensor:
                     say("All frames are served; Ctrl-C ends.")
                     threading.Event().wait()
             except KeyboardInterrupt:
@@ -185,8 +165,25 @@ class Session:
                 report.dropped = source.dropped - report.dropped_starting
                 report.stages = pipeline.times.summary()
             if seen.save is not None and self.last is not None:
-                self._write_beside(seen.save, picture=not viewer.window)
+                self._write_beside(seen.save)
         return self._code
+
+    def _open_viewer(self, pipeline: Pipeline, frames: int | None) -> Viewer:
+        """Open every place where the run is to be seen, and tell what came of it."""
+        viewer = Viewer(
+            self.settings.viewer,
+            live=self.report.live,
+            times=pipeline.times,
+            frames=frames,
+            title=self._uri + " acquired" * (self.settings.acquire.budget > 0),
+            fallback=Path("out", "live.rrd" if self._uri.startswith("openni") else "replay.rrd"),
+        )
+        self.settings = dataclasses.replace(self.settings, viewer=viewer.options)
+        for sentence in viewer.news():
+            say(sentence)
+        if viewer.served_url:
+            say(f"Serving; join with '{join_command(viewer.served_url)}'.")
+        return viewer
 
     def _flow(
         self, source: DepthSource, pipeline: Pipeline, viewer: Viewer, progress: FrameProgress
@@ -201,6 +198,8 @@ class Session:
                 progress.update(self.report.frames, f"{result.figures['fps']:.0f} frames/s")
 
         for read in feed:
+            for sentence in viewer.news():
+                progress.say(sentence)
             if read.state != state:
                 state = read.state
                 reason = getattr(source, "state_reason", "")
@@ -251,12 +250,12 @@ class Session:
         self.last = result
         viewer.show(result)
 
-    def _write_beside(self, saved: Path, *, picture: bool) -> None:
-        """Settings and, where no window showed it, a picture of the last frame."""
+    def _write_beside(self, saved: Path) -> None:
+        """Settings and a picture of the last frame."""
         settings_file, picture_file = _beside(saved)
         save_settings(settings_file, self.settings, self._uri)
         self.report.written += [saved, settings_file]
-        if picture and self.last is not None:
+        if self.last is not None:
             last = self.last
             row = StillRow(
                 f"{self._uri.rstrip('/').rpartition('/')[2]}, frame {last.frame.index}",

@@ -134,7 +134,7 @@ def take_screenshot(recording: Path, picture: Path, frame: int | None) -> int:
     OutputError
         If the picture cannot be written.
     """
-    from selective_depth.app.viewer import recording as viewer
+    from selective_depth.app import viewer
 
     check_picture(picture, IMAGES)
     with waiting("Loading it into the viewer"):

@@ -1,4 +1,4 @@
-"""Where a run is seen: file, served stream, remote viewer, window; none may hold it up."""
+"""Places where a run is seen: file, served stream, remote viewer, window; none may hold it up."""
 
 from __future__ import annotations
 
@@ -8,38 +8,51 @@ import socket
 import sys
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Container
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import urlsplit
+
+import rerun as rr
 
 from selective_depth.app.console.errors import ViewerError
 from selective_depth.app.console.output import cannot_write
 from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes
 from selective_depth.app.settings import ViewerOptions
-from selective_depth.app.viewer.handover import Handover
-from selective_depth.app.viewer.recording import WRITE_S, Recording, never_wait_at_exit, open_window
+from selective_depth.app.viewer.stream import WRITE_S, Recording
+from selective_depth.app.viewer.window import PORTS, ask, get_window, listens, local_url
 from selective_depth.drivers.errors import OutputError
 
-VIEWER_PORT = 9876
-PROBE_S = 0.3
-"""How long an address is tried. Where no viewer listens the SDK itself would block for 5 s
-and lose what is logged."""
-WINDOW_S = 10.0
-"""How long a window may take to open."""
-READY_S = 5.0
-"""How long a place may take to open before the run begins without it."""
 CHECK_EVERY_S = 1.0
-STALL_S = 0.5
-"""A viewer that takes longer over a step has stalled; a recording waits no more."""
 SPARE_BYTES = 64 << 20
 """Saving ends, with a whole file, when the disk has less room than this."""
 CLOSE_S = 1.0
-"""How long a place may take over its last frames, and all of them together:"""
-CLOSE_ALL_S = 2.5
-FILE_QUEUE = 8
-"""Steps of a sensor that may wait for a file, while what was written is made sure of."""
-INDEXED_FRAMES = 1000
-"""Up to so many frames a file gets an index; beyond, its memory would be felt."""
+"""How long a place may take over its last frames."""
+SERVE_S = 2.0
+"""How long a server may take to listen."""
+
+
+@dataclass(frozen=True)
+class Showing:
+    """What all places of a run have in common.
+
+    Attributes
+    ----------
+    options : ViewerOptions
+        What the user asked to see.
+    times : StageTimes
+        Where the time that logging takes is added, as stage ``log``.
+    tell : callable
+        Takes a sentence that the user should hear at once.
+    application : str
+        Application id: recordings of the same one share their layout in a viewer.
+    """
+
+    options: ViewerOptions
+    times: StageTimes
+    tell: Callable[[str], None]
+    application: str
 
 
 class Place(ABC):
@@ -49,10 +62,8 @@ class Place(ABC):
     ----------
     name : str
         What messages call it.
-    options : ViewerOptions
-        What the user asked to see.
-    times : StageTimes
-        Where the time that logging takes is added, as stage ``log``.
+    showing : Showing
+        What all places of the run have in common.
 
     Attributes
     ----------
@@ -60,11 +71,10 @@ class Place(ABC):
         Steps taken while nobody was there to see them.
     """
 
-    def __init__(self, name: str, options: ViewerOptions, times: StageTimes) -> None:
+    def __init__(self, name: str, showing: Showing) -> None:
         self.name = name
-        self.options = options
+        self.showing = showing
         self.missed = 0
-        self._times = times
         self._recording: Recording | None = None
 
     def open(self) -> None:
@@ -77,7 +87,7 @@ class Place(ABC):
         if isinstance(item, SensorNote):
             self._recording.log(item)
             return
-        with self._times.stage("log"):
+        with self.showing.times.stage("log"):
             self._recording.log(item)
 
     def close(self) -> None:
@@ -88,6 +98,11 @@ class Place(ABC):
             self._recording.finish()
         else:
             self._recording.abandon()
+
+    @property
+    def _what(self) -> tuple[str, ViewerOptions]:
+        """What any recording is made with."""
+        return self.showing.application, self.showing.options
 
     @abstractmethod
     def _connect(self) -> Recording:
@@ -102,14 +117,13 @@ class FilePlace(Place):
     failure the file is cut back to there.
     """
 
-    def __init__(
-        self, path: Path, options: ViewerOptions, times: StageTimes, *, index: bool
-    ) -> None:
-        super().__init__(f"file '{path}'", options, times)
+    def __init__(self, path: Path, showing: Showing, *, index: bool) -> None:
+        super().__init__(f"file '{path}'", showing)
         self.path = path
         self._index = index
         self._sure_bytes = 0
         self._checked_s = time.monotonic()
+        self._new = not path.exists()
         try:
             self._held = path.open("ab")  # what is there goes only when the run begins
             free = shutil.disk_usage(path.parent).free
@@ -143,8 +157,14 @@ class FilePlace(Place):
             self._recording.finish()
         self._held.close()
 
+    def discard(self) -> None:
+        """Let go of it before it was opened, and leave no empty file behind."""
+        self._held.close()
+        if self._new:
+            self.path.unlink(missing_ok=True)
+
     def _connect(self) -> Recording:
-        return Recording.to_file(self.path, self.options, index=self._index)
+        return Recording.to_file(self.path, *self._what, index=self._index)
 
     def _make_sure(self, patience_s: float = WRITE_S) -> None:
         assert self._recording is not None
@@ -162,21 +182,26 @@ class FilePlace(Place):
 class ServedPlace(Place):
     """Serves a stream that viewers join, on this machine only unless told otherwise."""
 
-    def __init__(self, options: ViewerOptions, times: StageTimes) -> None:
-        super().__init__(f"stream served on {options.serve_address}", options, times)
-        self.host, self.port = _host_and_port(options.serve_address)
-        self.url = f"rerun+http://{options.serve_address}/proxy"
-        try:
-            with socket.create_server((self.host, self.port)):
-                pass
-        except OSError as error:
-            raise ViewerError(
-                f"cannot serve on {options.serve_address}: {error.strerror}. Another program may"
-                " have the port; give --serve-address 127.0.0.1:PORT with a free one."
-            ) from None
+    def __init__(self, showing: Showing) -> None:
+        self.host, self.port = _place_to_serve(showing.options.serve_address)
+        super().__init__(f"stream served on {self.host}:{self.port}", showing)
+        host = _own_address() if self.host == "0.0.0.0" else self.host
+        self.url = f"rerun+http://{host}:{self.port}/proxy"
 
     def _connect(self) -> Recording:
-        return Recording.to_server(self.host, self.port, self.options)
+        try:
+            recording = Recording.to_server(self.host, self.port, *self._what)
+        except RuntimeError as error:
+            raise ViewerError(f"cannot serve on {self.host}:{self.port}: {error}.") from None
+        deadline_s = time.monotonic() + SERVE_S
+        while not listens((self.host, self.port)):
+            if time.monotonic() > deadline_s:
+                raise ViewerError(
+                    f"cannot serve on {self.host}:{self.port}: the server does not listen within"
+                    f" {SERVE_S:g} s. Give another --serve-address."
+                )
+            time.sleep(0.01)
+        return recording
 
 
 class RemotePlace(Place):
@@ -186,74 +211,95 @@ class RemotePlace(Place):
     memory, not the half gigabyte that the SDK would queue.
     """
 
-    def __init__(self, url: str, options: ViewerOptions, times: StageTimes, name: str = "") -> None:
-        super().__init__(name or f"viewer at {url}", options, times)
+    def __init__(self, url: str, showing: Showing, name: str = "") -> None:
+        super().__init__(name or f"viewer at {url}", showing)
         self.url = url
         self._checked_s = 0.0
-        parts = urlsplit(url)
-        try:
-            port = parts.port
-        except ValueError as error:
-            raise ViewerError(f"'{url}' is no viewer's address: {error}.") from None
-        if parts.scheme not in ("rerun", "rerun+http", "rerun+https") or not parts.hostname:
-            raise ViewerError(
-                f"'{url}' is no viewer's address; write --connect rerun+http://HOST:PORT/proxy."
-            )
-        self._address = (parts.hostname, port or VIEWER_PORT)
-        if not listens(self._address):
-            raise ViewerError(
-                f"no viewer listens at {url}. Start one there with 'rerun', or leave out --connect."
-            )
+        self._seen = False
+        self._address = _host_and_port(url)
+        self._meet()
 
     def put(self, item: FrameResult | SensorNote) -> None:
         """Log a step and see it off, however long the viewer takes."""
         if self._recording is None and time.monotonic() - self._checked_s > CHECK_EVERY_S:
             self._checked_s = time.monotonic()
-            if listens(self._address):
-                self.open()  # it is back
+            if self._is_back():
+                self.open()
         if self._recording is None:
             self.missed += isinstance(item, FrameResult)
             return
         super().put(item)
-        if not self._recording.flush():
-            self._recording.abandon()
-            self._recording = None
+        if self._recording.flush():
+            self._seen = True
+            return
+        self._recording.abandon()
+        self._recording = None
+        self._lose(item)
+
+    def close(self) -> None:
+        """Send what is left and let go; say so if the viewer has gone meanwhile."""
+        super().close()
+        if self._recording is not None and not listens(self._address):
+            self._tell_of_loss()
+
+    def _meet(self) -> None:
+        """See that a viewer listens, and which."""
+        listener = ask(self.url) if listens(self._address) else None
+        if listener is None:
+            raise ViewerError(
+                f"no viewer listens at {self.url}. Start one there with 'rerun', or leave out"
+                " --connect."
+            )
+        if not listener.rerun:
+            raise ViewerError(f"what listens at {self.url} is {listener.name}, no Rerun viewer.")
+        if not listener.fits:
+            self.showing.tell(
+                f"What listens at {self.url} is {listener.name}; views may stay empty in any other"
+                f" viewer than Rerun {rr.__version__}."
+            )
+
+    def _is_back(self) -> bool:
+        return listens(self._address)
+
+    def _lose(self, item: FrameResult | SensorNote) -> None:
+        """The viewer has gone while it was sent something."""
+        self.missed += isinstance(item, FrameResult)
+        self._tell_of_loss()
+
+    def _tell_of_loss(self) -> None:
+        self.showing.tell(f"The {self.name} was closed; the run goes on without it.")
 
     def _connect(self) -> Recording:
-        return Recording.to_viewer(self.url, self.options)
+        return Recording.to_viewer(self.url, *self._what)
 
 
 class WindowPlace(RemotePlace):
     """Opens a viewer window, or uses the one that is open, which outlives this program."""
 
-    def __init__(self, options: ViewerOptions, times: StageTimes) -> None:
-        port = VIEWER_PORT
-        if options.serve and _host_and_port(options.serve_address)[1] == VIEWER_PORT:
-            port += 1
-        address = ("127.0.0.1", port)
-        if not listens(address):
-            open_window(port, options.viewer_memory)
-            deadline_s = time.monotonic() + WINDOW_S
-            while not listens(address) and time.monotonic() < deadline_s:
-                time.sleep(0.05)
-        url = f"rerun+http://127.0.0.1:{port}/proxy"
-        super().__init__(url, options, times, name="viewer window")
+    def __init__(self, showing: Showing, taken: Container[int]) -> None:
+        self._taken = taken
+        self.awake = True
+        super().__init__(local_url(PORTS[0]), showing, "viewer window")
 
+    def _meet(self) -> None:
+        window = get_window(self.showing.options, self._taken)
+        self.awake, self.url = window.awake, window.url
+        self._address = _host_and_port(self.url)
+        for note in window.notes:
+            self.showing.tell(note)
 
-def has_display() -> bool:
-    """Whether a window can be opened here."""
-    if sys.platform in ("win32", "darwin"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    def _is_back(self) -> bool:
+        listener = ask(self.url) if super()._is_back() else None
+        return listener is not None and listener.fits
 
-
-def listens(address: tuple[str, int]) -> bool:
-    """Whether somebody accepts connections at an address (host, port)."""
-    try:
-        with socket.create_connection(address, PROBE_S):
-            return True
-    except OSError:
-        return False
+    def _lose(self, item: FrameResult | SensorNote) -> None:
+        if self._seen:
+            super()._lose(item)
+            return
+        # It was being closed when it was found: nothing was seen of the run, so open another.
+        self._meet()
+        self.open()
+        self.put(item)
 
 
 def _lock(file: BinaryIO) -> bool:
@@ -270,124 +316,51 @@ def _lock(file: BinaryIO) -> bool:
     return True
 
 
-def _host_and_port(address: str) -> tuple[str, int]:
-    host, _, port = address.rpartition(":")
-    if not host or ":" in host or not port.isdecimal() or not 0 < int(port) < 65536:
+def _host_and_port(url: str) -> tuple[str, int]:
+    """Where a viewer listens, of its address."""
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError as error:
+        raise ViewerError(f"'{url}' is no viewer's address: {error}.") from None
+    if parts.scheme not in ("rerun", "rerun+http", "rerun+https") or not parts.hostname:
         raise ViewerError(
-            f"'{address}' is no address to serve on; write HOST:PORT, such as 127.0.0.1:9876 (the"
-            " server takes no IPv6 address)."
+            f"'{url}' is no viewer's address; write --connect rerun+http://HOST:PORT/proxy."
         )
-    return host, int(port)
+    return parts.hostname, port or PORTS[0]
 
 
-class Viewer:
-    """Every place where a run is seen, each fed by a thread of its own.
-
-    Parameters
-    ----------
-    options : ViewerOptions
-        Which places.
-    live : bool
-        A live source waits for nobody: what a place has no time for is dropped there. A
-        recording waits for its file always, and for a viewer that is not stalled.
-    times : StageTimes
-        Where the time that logging takes is added, as stage ``log``.
-    frames : int, optional
-        How many frames will come at most; a file of few gets an index.
-
-    Attributes
-    ----------
-    window : bool
-        Whether a window shows the run.
-
-    Raises
-    ------
-    OutputError, ViewerError
-        If a place cannot be written, reached or opened.
-    """
-
-    def __init__(
-        self,
-        options: ViewerOptions,
-        *,
-        live: bool,
-        times: StageTimes,
-        frames: int | None = None,
-    ) -> None:
-        index = frames is not None and frames <= INDEXED_FRAMES
-        self.window = not options.headless and has_display()
-        self._places: list[Place] = []
-        if options.serve:
-            self._places.append(ServedPlace(options, times))
-        if options.connect is not None:
-            self._places.append(RemotePlace(options.connect, options, times))
-        if options.save is not None:
-            self._places.insert(0, FilePlace(options.save, options, times, index=index))
-        if self.window:
-            self._places.append(WindowPlace(options, times))
-        self._ways: list[Handover[FrameResult | SensorNote]] = []
-        for place in self._places:
-            file = isinstance(place, FilePlace)
-            self._ways.append(
-                Handover(
-                    place.name,
-                    place,
-                    lossless=file and not live,
-                    patience_s=0.0 if live else STALL_S,
-                    capacity=FILE_QUEUE if file and live else 2,
-                )
+def _place_to_serve(address: str | None) -> tuple[str, int]:
+    """A free address to serve on (IPv4, port): the one that was asked for, or on this machine."""
+    if address is None:
+        places = [("127.0.0.1", port) for port in PORTS]
+    else:
+        host, _, port = address.rpartition(":")
+        if not host or ":" in host or not port.isdecimal() or not 0 < int(port) < 65536:
+            raise ViewerError(
+                f"'{address}' is no address to serve on; write HOST:PORT, such as 127.0.0.1:9876"
+                " (the server takes no IPv6 address)."
             )
+        places = [(host, int(port))]
+    for host, number in places:
+        try:
+            found = socket.getaddrinfo(host, number, socket.AF_INET, socket.SOCK_STREAM)
+            resolved = str(found[0][4][0])
+            with socket.create_server((resolved, number)):
+                return resolved, number
+        except OSError as error:
+            reason = error.strerror
+    raise ViewerError(
+        f"cannot serve on {address or f'the ports {PORTS[0]}..{PORTS[-1]}'}: {reason}. Another"
+        " program may have the port; give --serve-address 127.0.0.1:PORT with a free one."
+    )
 
-    @property
-    def served_url(self) -> str:
-        """Address at which viewers join; empty if nothing is served."""
-        served = [place.url for place in self._places if isinstance(place, ServedPlace)]
-        return served[0] if served else ""
 
-    def wait_ready(self) -> None:
-        """Wait until every place is open, though for none that stalls."""
-        for way in self._ways:
-            way.ready.wait(READY_S)
-
-    def show(self, item: FrameResult | SensorNote) -> None:
-        """Hand a step, or the sensor's state without one, to every place.
-
-        Raises
-        ------
-        Exception
-            What ended the file that was asked for; a viewer that is gone is no error.
-        """
-        for place, way in zip(self._places, self._ways, strict=True):
-            way.offer(item)
-            if isinstance(place, FilePlace) and way.failure is not None:
-                raise way.failure
-
-    @property
-    def file_failed(self) -> bool:
-        """Whether a file that was asked for ended before its time."""
-        pairs = zip(self._places, self._ways, strict=True)
-        return any(isinstance(place, FilePlace) and way.failure for place, way in pairs)
-
-    @property
-    def dropped(self) -> dict[str, int]:
-        """Steps that each place has missed, by its name."""
-        pairs = zip(self._places, self._ways, strict=True)
-        return {place.name: place.missed + way.dropped for place, way in pairs}
-
-    def close(self) -> list[str]:
-        """Finish every place, all of them within 3 s.
-
-        Returns
-        -------
-        list of str
-            What went wrong, a sentence each.
-        """
-        never_wait_at_exit()
-        deadline_s = time.monotonic() + CLOSE_ALL_S
-        troubles = []
-        for way in self._ways:
-            if not way.finish(max(0.1, deadline_s - time.monotonic())):
-                troubles.append(f"the {way.name} had stalled and was left behind.")
-            elif way.failure is not None:
-                troubles.append(f"the {way.name} ended early: {way.failure}")
-        return troubles
+def _own_address() -> str:
+    """This machine's address in its network, as others can reach it; nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way_out:
+        try:
+            way_out.connect(("192.0.2.1", 9))  # an address kept for documentation
+            return str(way_out.getsockname()[0])
+        except OSError:
+            return socket.gethostname()  # no network

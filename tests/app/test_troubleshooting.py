@@ -46,8 +46,8 @@ def nobody_listens(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def no_display(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    monkeypatch.setattr("selective_depth.app.viewer.sinks.has_display", lambda: False)
-    monkeypatch.setattr("selective_depth.app.commands.run.has_display", lambda: False)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.chdir(folder)
     return ["replay", BALL, "--seeds.rows", "24", "--seeds.columns", "32", "--gas.nodes", "50"]
 

@@ -28,8 +28,10 @@ from selective_depth.app.console.errors import UsageError, ViewerError
 from selective_depth.app.pictures import palette as legend
 from selective_depth.app.pipeline import STAGES, FrameResult, Model, SensorNote, StageTimes
 from selective_depth.app.settings import ViewerOptions
-from selective_depth.app.viewer import recording as viewer
-from selective_depth.app.viewer import sinks as places
+from selective_depth.app.viewer import Viewer, screenshot, sinks, viewer, window
+from selective_depth.app.viewer.blueprint import blueprint
+from selective_depth.app.viewer.logger import DEPTH_COLOURS
+from selective_depth.app.viewer.stream import Recording
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.selectors.acquire.loop import Acquisition, Round
@@ -87,7 +89,7 @@ def make_step(index: int, *, acquiring: bool = True) -> FrameResult:
 
 def save(path: Path, steps: list[FrameResult], **options: Any) -> None:
     chosen = dataclasses.replace(HEADLESS, save=path, **options)
-    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=100)
+    shown = Viewer(chosen, live=False, times=StageTimes(), frames=100)
     for step in steps:
         shown.show(step)
     assert shown.close() == []
@@ -151,7 +153,7 @@ def test_every_view_shows_something_that_was_logged(
 ) -> None:
     save(tmp_path / "out.rrd", [make_step(0, acquiring=acquiring)], detail=detail)
     logged = rows_of(tmp_path / "out.rrd")
-    views = views_of(viewer.blueprint(acquiring=acquiring, detail=detail))
+    views = views_of(blueprint(acquiring=acquiring, detail=detail))
     assert len(views) >= (11 if acquiring else 8)
     for view in views:
         contents = view.contents
@@ -164,7 +166,7 @@ def test_every_view_shows_something_that_was_logged(
 
 def test_sensor_state_is_logged_when_it_changes(tmp_path: Path) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
-    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=100)
+    shown = Viewer(chosen, live=False, times=StageTimes(), frames=100)
     shown.show(SensorNote("lost"))  # before the first frame there is no time to log it at
     shown.show(make_step(0))
     for state in ("stalled", "stalled", "lost", "reconnecting"):
@@ -194,7 +196,7 @@ def test_colour_limits_hold_for_the_whole_run(tmp_path: Path) -> None:
 def test_unwritable_file_is_refused_at_once(tmp_path: Path, place: str) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / place)
     with pytest.raises(OutputError, match="cannot be written"):
-        places.Viewer(chosen, live=False, times=StageTimes())
+        Viewer(chosen, live=False, times=StageTimes())
 
 
 def test_a_refused_run_leaves_an_older_file_as_it_is(tmp_path: Path) -> None:
@@ -203,20 +205,20 @@ def test_a_refused_run_leaves_an_older_file_as_it_is(tmp_path: Path) -> None:
         HEADLESS, save=tmp_path / "old.rrd", connect="rerun+http://127.0.0.1:1/proxy"
     )
     with pytest.raises(ViewerError, match="no viewer listens"):
-        places.Viewer(chosen, live=False, times=StageTimes())
+        Viewer(chosen, live=False, times=StageTimes())
     assert (tmp_path / "old.rrd").read_bytes() == b"precious"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX locks")
 def test_a_file_belongs_to_one_run_at_a_time(tmp_path: Path) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
-    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=2)
+    shown = Viewer(chosen, live=False, times=StageTimes(), frames=2)
     with pytest.raises(OutputError, match="another run is writing"):
-        places.Viewer(chosen, live=False, times=StageTimes())
+        Viewer(chosen, live=False, times=StageTimes())
     shown.show(make_step(0))
     assert shown.close() == []
     assert len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)) == 1
-    places.Viewer(chosen, live=False, times=StageTimes()).close()
+    Viewer(chosen, live=False, times=StageTimes()).close()
 
 
 def test_a_disk_that_is_nearly_full_is_refused_at_once(
@@ -226,12 +228,12 @@ def test_a_disk_that_is_nearly_full_is_refused_at_once(
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100 << 20))
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
     with pytest.raises(OutputError, match="100 MiB are free there"):
-        places.Viewer(chosen, live=False, times=StageTimes())
+        Viewer(chosen, live=False, times=StageTimes())
 
 
 def test_full_disk_ends_the_file_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
-    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=100)
+    shown = Viewer(chosen, live=False, times=StageTimes(), frames=100)
     usage = shutil.disk_usage(tmp_path)
     room = iter([1 << 30] * 3)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=next(room, 1 << 20)))
@@ -250,18 +252,18 @@ def test_a_recording_waits_for_its_file_and_a_sensor_for_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, live: bool
 ) -> None:
     go_on = threading.Event()
-    plain = viewer.Recording.log
+    plain = Recording.log
 
-    def slow(self: viewer.Recording, item: FrameResult | SensorNote) -> None:
+    def slow(self: Recording, item: FrameResult | SensorNote) -> None:
         if live:
             go_on.wait()
         else:
             time.sleep(0.05)
         plain(self, item)
 
-    monkeypatch.setattr(viewer.Recording, "log", slow)
+    monkeypatch.setattr(Recording, "log", slow)
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
-    shown = places.Viewer(chosen, live=live, times=StageTimes(), frames=100)
+    shown = Viewer(chosen, live=live, times=StageTimes(), frames=100)
     for index in range(20):
         shown.show(make_step(index))
     dropped = sum(shown.dropped.values())
@@ -270,26 +272,26 @@ def test_a_recording_waits_for_its_file_and_a_sensor_for_nothing(
     saved = len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16))
     assert (saved, dropped) == ((20 - dropped, 20 - saved) if live else (20, 0))
     if live:
-        assert saved in (places.FILE_QUEUE, places.FILE_QUEUE + 1)  # and one in hand
+        assert saved in (viewer.FILE_QUEUE, viewer.FILE_QUEUE + 1)  # and one in hand
 
 
 def test_a_write_that_fails_costs_no_more_than_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
-    monkeypatch.setattr(places, "CHECK_EVERY_S", 0.0)  # make sure after every step
-    shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=2000)
-    plain, calls = viewer.Recording.flush, itertools.count()
+    monkeypatch.setattr(sinks, "CHECK_EVERY_S", 0.0)  # make sure after every step
+    shown = Viewer(chosen, live=False, times=StageTimes(), frames=2000)
+    plain, calls = Recording.flush, itertools.count()
     sure: list[int] = []
 
-    def flush(self: viewer.Recording, timeout_s: float = 1e9) -> bool:
+    def flush(self: Recording, timeout_s: float = 1e9) -> bool:
         done = plain(self, timeout_s)
         if next(calls) < 3:
             sure.append((tmp_path / "out.rrd").stat().st_size)
             return done
         return False
 
-    monkeypatch.setattr(viewer.Recording, "flush", flush)
+    monkeypatch.setattr(Recording, "flush", flush)
     with pytest.raises(OutputError, match=r"failed after [\d,]+ bytes, which are kept"):
         for index in range(100):
             shown.show(make_step(index))
@@ -303,7 +305,7 @@ def test_a_write_that_fails_costs_no_more_than_itself(
 )
 def test_address_that_is_none_is_refused(url: str) -> None:
     with pytest.raises(ViewerError, match="no viewer's address"):
-        places.Viewer(dataclasses.replace(HEADLESS, connect=url), live=True, times=StageTimes())
+        Viewer(dataclasses.replace(HEADLESS, connect=url), live=True, times=StageTimes())
 
 
 def test_absent_viewer_is_noticed_at_once() -> None:
@@ -312,7 +314,7 @@ def test_absent_viewer_is_noticed_at_once() -> None:
     chosen = dataclasses.replace(HEADLESS, connect=f"rerun+http://127.0.0.1:{port}/proxy")
     start_s = time.monotonic()
     with pytest.raises(ViewerError, match="no viewer listens"):
-        places.Viewer(chosen, live=True, times=StageTimes())
+        Viewer(chosen, live=True, times=StageTimes())
     assert time.monotonic() - start_s < 2
 
 
@@ -320,7 +322,7 @@ def test_absent_viewer_is_noticed_at_once() -> None:
 def test_serve_address_is_checked(address: str) -> None:
     chosen = dataclasses.replace(HEADLESS, serve=True, serve_address=address)
     with pytest.raises(ViewerError, match="no address"):
-        places.Viewer(chosen, live=True, times=StageTimes())
+        Viewer(chosen, live=True, times=StageTimes())
 
 
 def test_taken_port_is_refused() -> None:
@@ -329,7 +331,7 @@ def test_taken_port_is_refused() -> None:
             HEADLESS, serve=True, serve_address=f"127.0.0.1:{taken.getsockname()[1]}"
         )
         with pytest.raises(ViewerError, match="cannot serve"):
-            places.Viewer(chosen, live=True, times=StageTimes())
+            Viewer(chosen, live=True, times=StageTimes())
 
 
 @pytest.fixture
@@ -339,7 +341,7 @@ def listener() -> Iterator[Listener]:
     made.kill()
 
 
-def show_for(shown: places.Viewer, seconds: float, step: FrameResult) -> tuple[int, float]:
+def show_for(shown: Viewer, seconds: float, step: FrameResult) -> tuple[int, float]:
     """Show steps for a while; return how many and the longest time that one took."""
     count, longest_s = 0, 0.0
     end_s = time.monotonic() + seconds
@@ -357,7 +359,7 @@ def test_stalled_viewer_holds_up_nobody_and_spares_the_file(
     listener: Listener, tmp_path: Path
 ) -> None:
     options = dataclasses.replace(listener.options, save=tmp_path / "out.rrd")
-    shown = places.Viewer(options, live=True, times=StageTimes(), frames=100)
+    shown = Viewer(options, live=True, times=StageTimes(), frames=100)
     step = make_step(0)
     show_for(shown, 1.0, step)
     before = shown.dropped
@@ -377,7 +379,7 @@ def test_stalled_viewer_holds_up_nobody_and_spares_the_file(
 
 
 def test_killed_viewer_is_found_again_when_it_is_back(listener: Listener) -> None:
-    shown = places.Viewer(listener.options, live=True, times=StageTimes())
+    shown = Viewer(listener.options, live=True, times=StageTimes())
     step = make_step(0)
     show_for(shown, 1.0, step)
     listener.kill()
@@ -397,7 +399,7 @@ def test_server_that_never_answers_ends_in_time() -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         url = f"rerun+http://127.0.0.1:{mute.getsockname()[1]}/proxy"
         options = dataclasses.replace(HEADLESS, connect=url)
-        shown = places.Viewer(options, live=True, times=StageTimes())
+        shown = Viewer(options, live=True, times=StageTimes())
         _, longest_s = show_for(shown, 0.5, make_step(0))
         start_s = time.monotonic()
         troubles = shown.close()
@@ -406,32 +408,20 @@ def test_server_that_never_answers_ends_in_time() -> None:
     assert "left behind" in troubles[0]
 
 
-def test_two_that_have_stalled_are_left_behind_in_the_time_of_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as mute:
-        port = int(mute.getsockname()[1])
-        monkeypatch.setattr(places, "has_display", lambda: True)
-        monkeypatch.setattr(places, "VIEWER_PORT", port)
-        options = ViewerOptions(connect=f"rerun+http://127.0.0.1:{port}/proxy")
-        shown = places.Viewer(options, live=True, times=StageTimes())
+def test_two_that_have_stalled_are_left_behind_in_the_time_of_one(listener: Listener) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    options = dataclasses.replace(listener.options, serve=True, serve_address=address)
+    shown = Viewer(options, live=True, times=StageTimes())
+    with Listener(follow=shown.served_url) as second:
         show_for(shown, 0.5, make_step(0))
+        for stopped in (listener, second):
+            stopped.process.send_signal(signal.SIGSTOP)
+        show_for(shown, 1.0, make_step(0))
         start_s = time.monotonic()
         troubles = shown.close()
-    assert len(troubles) == 2
-    assert time.monotonic() - start_s < 3
-
-
-def test_a_window_goes_beside_what_is_served(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(places, "listens", lambda address: True)
-    served = ViewerOptions(serve=True, serve_address=f"127.0.0.1:{places.VIEWER_PORT}")
-    elsewhere = ViewerOptions(serve=True, serve_address="127.0.0.1:1234")
-    for options, port in (
-        (ViewerOptions(), places.VIEWER_PORT),
-        (elsewhere, places.VIEWER_PORT),
-        (served, places.VIEWER_PORT + 1),
-    ):
-        assert f":{port}/" in places.WindowPlace(options, StageTimes()).url
+        assert time.monotonic() - start_s < 3
+    assert any("had stalled and was left behind" in trouble for trouble in troubles)
 
 
 def test_two_places_see_the_same(tmp_path: Path) -> None:
@@ -440,39 +430,17 @@ def test_two_places_see_the_same(tmp_path: Path) -> None:
     options = dataclasses.replace(
         HEADLESS, save=tmp_path / "out.rrd", serve=True, serve_address=address
     )
-    shown = places.Viewer(options, live=False, times=StageTimes(), frames=100)
+    shown = Viewer(options, live=False, times=StageTimes(), frames=100)
     for index in range(5):
         shown.show(make_step(index))
     assert shown.close() == []
     assert len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)) == 5
 
 
-def test_window_is_opened_and_used(monkeypatch: pytest.MonkeyPatch, listener: Listener) -> None:
-    opened: list[int] = []
-
-    def open_window(port: int, memory: str) -> None:
-        opened.append(port)
-        listener.start()
-
-    listener.kill()
-    monkeypatch.setattr(places, "has_display", lambda: True)
-    monkeypatch.setattr(places, "open_window", open_window)
-    monkeypatch.setattr(places, "VIEWER_PORT", listener.port)
-    for _ in range(2):  # the second run finds the window of the first
-        shown = places.Viewer(ViewerOptions(), live=False, times=StageTimes())
-        assert shown.window
-        shown.wait_ready()
-        for index in range(3):
-            shown.show(make_step(index))
-        assert shown.close() == []
-        assert shown.dropped == {"viewer window": 0}
-    assert opened == [listener.port]
-
-
 def picture_of(recording: Path, frame: int | None = None) -> np.ndarray:
     """A screenshot; no other trouble than a missing graphics driver is a reason to skip."""
     try:
-        return viewer.screenshot(recording, frame)
+        return screenshot(recording, frame)
     except ViewerError as error:
         if "does not start" in str(error):
             pytest.skip(f"no graphics driver: {error}")
@@ -491,13 +459,11 @@ def test_a_picture_shows_the_frame_that_was_asked_for(tmp_path: Path) -> None:
     last, first = picture_of(recording), picture_of(recording, 0)
     for picture, level in ((last, 255), (first, 0)):
         view = picture[60:380, :540].reshape(-1, 3).astype(int)
-        blue, green, red = (
-            int(viewer.DEPTH_COLOURS[level]) >> shift & 255 for shift in (8, 16, 24)
-        )
+        blue, green, red = (int(DEPTH_COLOURS[level]) >> shift & 255 for shift in (8, 16, 24))
         like = np.abs(view - (blue, green, red)).max(axis=1) < 12
         assert like.mean() > 0.3, "the frame's depth is not what is seen of the sensor"
     with pytest.raises(UsageError, match=r"--frame is 3; the frames of .* are 0\.\.2"):
-        viewer.screenshot(recording, 3)
+        screenshot(recording, 3)
 
 
 def test_a_picture_of_a_recording_that_holds_nothing_is_refused(tmp_path: Path) -> None:
@@ -536,7 +502,7 @@ class SlowPage(http.server.BaseHTTPRequestHandler):
 def test_web_viewer_shows_the_run(tmp_path: Path) -> None:
     """To be looked at with one's own eyes; here only that it is neither empty nor failing."""
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
-    executable = viewer.viewer_executable()
+    executable = window.viewer_executable()
     if chromium is None or executable is None:
         pytest.skip("no Chromium, or no web viewer in the SDK")
     recording = tmp_path / "run.rrd"

@@ -1,0 +1,242 @@
+"""What is logged: one step of a run, or one frame after trainings of several lengths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import rerun as rr
+
+from selective_depth.app.pictures import palette as legend
+from selective_depth.app.pipeline import STAGES, FrameResult
+from selective_depth.app.settings import ViewerOptions
+from selective_depth.app.viewer.blueprint import blueprint, epoch_blueprint
+from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.selectors.neural_gas import RegionSelection
+
+DEPTH_COLOURS = legend.palette(legend.DEPTH_COLOURMAP)
+CENTRE = np.float32(0.5)
+"""Rerun puts pixel centres at halves, we at whole numbers."""
+
+
+class StepLogger:
+    """Logs steps into one recording stream, from one thread.
+
+    Parameters
+    ----------
+    stream : rr.RecordingStream
+        Where to.
+    options : ViewerOptions
+        What the user asked to see.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, options: ViewerOptions) -> None:
+        self._stream = stream
+        self._options = options
+        self._start_us: int | None = None
+        self._state = ""
+        self._limits_mm = (0.0, 1.0)
+
+    def log(self, step: FrameResult) -> None:
+        """Log a step under its frame's number and time."""
+        if self._start_us is None:
+            self._start_us = step.frame.timestamp_us
+            self._log_static(step)
+        self._stream.set_time("frame", sequence=step.frame.index)
+        elapsed_us = step.frame.timestamp_us - self._start_us
+        self._stream.set_time("time", duration=elapsed_us / 1e6)
+        self._log_sensor(step)
+        self._log_gas(step.regions)
+        self._log_improvement(step)
+        self._log_acquisition(step)
+        self._log_figures(step)
+
+    def log_trainings(
+        self, frame: DepthFrame, trainings: Iterable[tuple[int, RegionSelection]]
+    ) -> None:
+        """Log the regions of one frame after trainings of several lengths, by epoch."""
+        near, far = legend.depth_limits_mm(frame.depth_mm)
+        self._limits_mm = (float(near), float(far))
+        self._stream.send_blueprint(epoch_blueprint(self._limits_mm), make_default=True)
+        self._stream.send_recording_name(f"epochs of {frame.source}")
+        self._log_camera(frame.camera)
+        self._log_classes()
+        holes = rr.SegmentationImage((frame.depth_mm == 0).view(np.uint8), opacity=1.0)
+        self._stream.log("camera/depth", self._depth_image(frame.depth_mm), static=True)
+        self._stream.log("camera/holes", holes, static=True)
+        for epoch, regions in trainings:
+            self._stream.set_time("epoch", sequence=epoch)
+            self._log_gas(regions)
+            error = rr.Scalars(regions.quantisation_error_mm)
+            self._stream.log("figures/quantisation_error_mm", error)
+
+    def log_state(self, state: str) -> None:
+        """Log the sensor's state, if it has changed, under the time of the last step."""
+        if state != self._state and self._start_us is not None:
+            self._state = state
+            self._stream.log("sensor/state", rr.StateChange(state=state))
+
+    def _log_static(self, step: FrameResult) -> None:
+        camera, log, options = step.frame.camera, self._stream.log, self._options
+        near, far = legend.depth_limits_mm(step.frame.depth_mm)
+        near = near if options.near_mm is None else options.near_mm
+        far = far if options.far_mm is None else options.far_mm
+        self._limits_mm = (float(near), float(max(far, near + 1)))
+        layout = blueprint(
+            acquiring=step.acquisition is not None,
+            detail=options.detail,
+            look_at_m=_middle_m(step.frame.depth_mm),
+            limits_mm=self._limits_mm,
+        )
+        self._stream.send_blueprint(layout, make_default=True)
+        self._stream.send_recording_name(step.frame.source or "depth")
+        self._log_camera(camera)
+        pixels = step.seeds.lattice_uv.reshape(-1, 2) + CENTRE
+        log("camera/seeds", rr.Points2D.from_fields(positions=pixels, radii=1.6), static=True)
+        self._log_classes()
+        rounds = 0 if step.acquisition is None else int(step.acquisition.round.max(initial=0))
+        log("legend", rr.Image(legend.picture(self._limits_mm, rounds)), static=True)
+        log("guide", rr.TextDocument(legend.HOW_TO_READ, media_type="text/markdown"), static=True)
+        states = rr.StateConfiguration(
+            values=list(legend.STATE_COLOURS),
+            labels=list(legend.STATE_COLOURS),
+            colors=list(legend.STATE_COLOURS.values()),
+        )
+        log("sensor/state", states, static=True)
+        stages = rr.SeriesLines(names=list(STAGES), colors=list(legend.STAGE_COLOURS))
+        log("figures/stages", stages, static=True)
+        for name, (label, colour) in legend.FIGURES.items():
+            log(f"figures/{name}", rr.SeriesLines(names=label, colors=colour), static=True)
+
+    def _log_camera(self, camera: Camera) -> None:
+        log = self._stream.log
+        log("/", rr.ViewCoordinates.RDF, static=True)
+        pinhole = rr.Pinhole(
+            resolution=[camera.width, camera.height],
+            focal_length=[camera.fx, camera.fy],
+            principal_point=[camera.cx + CENTRE, camera.cy + CENTRE],
+            image_plane_distance=0.3,
+        )
+        log("camera", pinhole, static=True)
+
+    def _log_classes(self) -> None:
+        log = self._stream.log
+        nothing = (0, "", (0, 0, 0, 0))
+        hole = (1, legend.UNKNOWN, legend.HOLE)
+        kept, long = (1, "kept triangles", legend.REGION), (2, "long edges", legend.LONG_EDGE)
+        # A class means what the nearest context above says: one for all, one for the regions.
+        log("camera", rr.AnnotationContext([nothing, hole]), static=True)
+        log("camera/gas", rr.AnnotationContext([nothing, kept, long]), static=True)
+
+    def _log_sensor(self, step: FrameResult) -> None:
+        log, depth_mm, seeds = self._stream.log, step.frame.depth_mm, step.seeds
+        log("camera/depth", self._depth_image(depth_mm))
+        log("camera/holes", rr.SegmentationImage((depth_mm == 0).view(np.uint8), opacity=1.0))
+        near, far = self._limits_mm
+        level = np.clip((seeds.depth_mm.ravel() - near) * (255 / (far - near)), 0, 255)
+        colours = np.where(
+            seeds.valid.ravel(), DEPTH_COLOURS[level.astype(np.uint8)], np.uint32(legend.HOLE)
+        )
+        log("camera/seeds", rr.Points2D.from_fields(colors=colours))
+        self.log_state(step.state)
+
+    def _log_gas(self, regions: RegionSelection) -> None:
+        log = self._stream.log
+        log("camera/gas/mask", rr.SegmentationImage(regions.mask.view(np.uint8)))
+        if self._options.detail:
+            complement = rr.SegmentationImage(regions.complement.astype(np.uint8) * 2)
+            log("camera/gas/complement", complement)
+        nodes_uv, kept = regions.nodes_uv + CENTRE, regions.triangles[regions.kept]
+        outlines = nodes_uv[kept[:, (0, 1, 2, 0)]]
+        strips = rr.LineStrips2D(_closed_strips(outlines), colors=legend.MESH, radii=0.35)
+        log("camera/gas/triangles", strips)
+        log("camera/gas/nodes", rr.Points2D(nodes_uv, colors=legend.NODE, radii=1.4))
+        nodes_m = regions.nodes_mm * np.float32(0.001)
+        log("world/nodes", rr.Points3D(nodes_m, colors=legend.NODE, radii=-1.5))
+        mesh = rr.Mesh3D(
+            vertex_positions=nodes_m, triangle_indices=kept, albedo_factor=legend.REGION
+        )
+        log("world/regions", mesh)
+
+    def _log_improvement(self, step: FrameResult) -> None:
+        log, improvement = self._stream.log, step.improvement
+        known = improvement.known
+        log("camera/improvement/score", _map_image(improvement.score, legend.IMPROVEMENT, known))
+        log(
+            "camera/improvement/unknown", rr.SegmentationImage((~known).view(np.uint8), opacity=1.0)
+        )
+        if self._options.detail:
+            log(
+                "camera/improvement/estimate", self._depth_image(_as_depth(improvement.estimate_mm))
+            )
+            deviation_mm = np.sqrt(np.where(known, improvement.variance_mm2, 0))
+            image = _map_image(deviation_mm, legend.ERROR, known)
+            log("camera/improvement/deviation", image)
+
+    def _log_acquisition(self, step: FrameResult) -> None:
+        log, acquisition = self._stream.log, step.acquisition
+        if acquisition is None:
+            return
+        shot = acquisition.round > 0
+        uv, depth_mm, rounds = (
+            array[shot] for array in (acquisition.uv, acquisition.depth_mm, acquisition.round)
+        )
+        colours = legend.round_colours(int(rounds.max(initial=0)))[rounds]
+        log("camera/samples", rr.Points2D(uv + CENTRE, colors=colours, radii=0.9))
+        hit = depth_mm > 0
+        points_m = step.frame.camera.points_mm(uv[hit], depth_mm[hit]) * np.float32(0.001)
+        log("world/samples", rr.Points3D(points_m, colors=colours[hit], radii=-1.5))
+        if step.model is not None:
+            log("camera/model", self._depth_image(_as_depth(step.model.depth_mm)))
+            error_mm = step.model.error_mm
+            known = ~np.isnan(error_mm)
+            log("camera/error", _map_image(error_mm, legend.ERROR, known))
+
+    def _log_figures(self, step: FrameResult) -> None:
+        log = self._stream.log
+        log("figures/stages", rr.Scalars([step.stages_ms.get(name, np.nan) for name in STAGES]))
+        for name, value in step.figures.items():
+            if np.isfinite(value):
+                log(f"figures/{name}", rr.Scalars(value))
+
+    def _depth_image(self, depth_mm: npt.NDArray[np.uint16]) -> rr.DepthImage:
+        return rr.DepthImage(
+            depth_mm,
+            meter=1000.0,
+            colormap=legend.DEPTH_COLOURMAP,
+            depth_range=list(self._limits_mm),
+        )
+
+
+def _middle_m(depth_mm: npt.NDArray[np.uint16]) -> float:
+    """Median depth in metres; 2 m without any."""
+    known = depth_mm[depth_mm > 0]
+    return float(np.median(known)) / 1000 if known.size else 2.0
+
+
+def _as_depth(value_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
+    return np.where(value_mm > 0, value_mm, np.float32(0)).astype(np.uint16)
+
+
+def _map_image(
+    value: npt.NDArray[np.float32], scale: legend.Scale, known: npt.NDArray[np.bool_]
+) -> rr.DepthImage:
+    """Values on a scale from 0 as a coloured 8-bit image: 1..255, and 0 where nothing is known."""
+    # Saturates in one pass; what it makes of a NaN does not matter, that is nowhere known.
+    levels = np.asarray(cv2.convertScaleAbs(value, alpha=254 / scale.limits[1], beta=1))
+    np.multiply(levels, known, out=levels)
+    return rr.DepthImage(levels, colormap=scale.colormap, depth_range=[1.0, 255.0])
+
+
+def _closed_strips(points_uv: npt.NDArray[np.float32]) -> pa.Array:
+    """Line strips of shape (n, points, 2) as the SDK holds them, without its loop over n."""
+    count, length, _ = points_uv.shape
+    inner = rr.encodings.Vec2DBatch(points_uv.reshape(-1, 2)).as_arrow_array()
+    offsets = pa.array(np.arange(0, (count + 1) * length, length, dtype=np.int32))
+    return pa.ListArray.from_arrays(offsets, inner, type=_STRIPS)
+
+
+_STRIPS = rr.components.LineStrip2DBatch([]).as_arrow_array().type

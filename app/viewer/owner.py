@@ -1,0 +1,56 @@
+"""Whose a port is: the process that listens there, its program, and the screen it is on."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")
+_LISTENING = "0A"
+_PROC = Path("/proc")
+
+
+@dataclass(frozen=True)
+class Owner:
+    """The process that listens on a port of this machine.
+
+    Attributes
+    ----------
+    program : Path or None
+        What it runs; None where that is not known: on systems without ``/proc``, and of other
+        users' processes.
+    same_screen : bool
+        Whether its windows are where ours would be; false of other users' processes, true where
+        the system does not tell.
+    """
+
+    program: Path | None
+    same_screen: bool
+
+
+def owner_of(port: int) -> Owner:
+    """Who listens on a port of this machine, as Linux tells it under ``/proc``."""
+    table = _PROC / "net" / "tcp"
+    if not table.is_file():
+        return Owner(None, same_screen=True)
+    links = set()
+    for line in table.read_text().splitlines()[1:]:
+        _, local, _, state, *_, inode = line.split()[:10]
+        if state == _LISTENING and int(local.rpartition(":")[2], 16) == port:
+            links.add(f"socket:[{inode}]")
+    for process in _PROC.glob("[0-9]*"):
+        try:
+            if any(str(handle.readlink()) in links for handle in (process / "fd").iterdir()):
+                theirs = (process / "environ").read_bytes().split(b"\0")
+                program = (process / "exe").resolve()
+                return Owner(program, all(_same(name, theirs) for name in SCREENS))
+        except OSError:
+            continue  # another user's, or it has just ended
+    return Owner(None, same_screen=False)
+
+
+def _same(name: str, theirs: list[bytes]) -> bool:
+    ours = os.environ.get(name)
+    value = next((each for each in theirs if each.startswith(f"{name}=".encode())), None)
+    return value == (None if ours is None else f"{name}={ours}".encode())

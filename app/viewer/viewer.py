@@ -1,0 +1,222 @@
+"""Every place where a run is seen, each fed by a thread of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import time
+from collections import deque
+from pathlib import Path
+
+from selective_depth.app.console.errors import ViewerError
+from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes
+from selective_depth.app.settings import ViewerOptions
+from selective_depth.app.viewer.handover import Handover
+from selective_depth.app.viewer.sinks import (
+    FilePlace,
+    Place,
+    RemotePlace,
+    ServedPlace,
+    Showing,
+    WindowPlace,
+)
+from selective_depth.app.viewer.stream import APPLICATION, never_wait_at_exit
+from selective_depth.app.viewer.window import BIRTH_S, has_display
+from selective_depth.drivers.errors import OutputError
+
+READY_S = 5.0
+"""How long a place may take to open before the run begins without it."""
+STALL_S = 0.5
+"""A viewer that takes longer over a step has stalled; a recording waits no more."""
+CLOSE_ALL_S = 2.5
+"""How long all places together may take over their last frames."""
+FILE_QUEUE = 8
+"""Steps of a sensor that may wait for a file, while what was written is made sure of."""
+INDEXED_FRAMES = 1000
+"""Up to so many frames a file gets an index; beyond, its memory would be felt."""
+
+
+class Viewer:
+    """Every place where a run is seen, each fed by a thread of its own.
+
+    Parameters
+    ----------
+    options : ViewerOptions
+        Which places.
+    live : bool
+        A live source waits for nobody: what a place has no time for is dropped there. A
+        recording waits for its file always, and for a viewer that is not stalled.
+    times : StageTimes
+        Where the time that logging takes is added, as stage ``log``.
+    frames : int, optional
+        How many frames will come at most; a file of few gets an index.
+    title : str, default ""
+        What is run and how. Runs of the same title share their layout where a viewer has several.
+    fallback : Path, optional
+        File to save to where nothing was asked for and no window opens; by default none.
+
+    Attributes
+    ----------
+    options : ViewerOptions
+        Which places it came to: with the fallback as `save`, if it was needed.
+
+    Raises
+    ------
+    OutputError, ViewerError
+        If a place cannot be written, reached or served. A window that does not start is none
+        of these: it is told by `news`.
+    """
+
+    def __init__(
+        self,
+        options: ViewerOptions,
+        *,
+        live: bool,
+        times: StageTimes,
+        frames: int | None = None,
+        title: str = "",
+        fallback: Path | None = None,
+    ) -> None:
+        self.options = options
+        self._news: deque[str] = deque()
+        self._index = frames is not None and frames <= INDEXED_FRAMES
+        showing = Showing(options, times, self._news.append, _application(title, options))
+        self._places: list[Place] = []
+        try:
+            self._open_all(showing, fallback)
+        except Exception:
+            for place in self._places:
+                if isinstance(place, FilePlace):
+                    place.discard()
+            raise
+        self._ways: list[Handover[FrameResult | SensorNote]] = []
+        for place in self._places:
+            file = isinstance(place, FilePlace)
+            self._ways.append(
+                Handover(
+                    place.name,
+                    place,
+                    lossless=file and not live,
+                    patience_s=0.0 if live else STALL_S,
+                    capacity=FILE_QUEUE if file and live else 2,
+                )
+            )
+        self._see_served()
+
+    def _open_all(self, showing: Showing, fallback: Path | None) -> None:
+        options = self.options
+        if options.save is not None:
+            self._places.append(FilePlace(options.save, showing, index=self._index))
+        if options.serve:
+            self._places.append(ServedPlace(showing))
+        if options.connect is not None:
+            self._places.append(RemotePlace(options.connect, showing))
+        if options.headless or options.connect is not None:
+            return
+        display = has_display()
+        why = self._open_window(showing) if display else "No display here."
+        saved = bool(why) and fallback is not None and not (options.save or options.serve)
+        if saved and fallback is not None:
+            self._save_instead(fallback, showing)
+            why += f" Saving to {fallback}; open it with 'rerun {fallback}'."
+        if saved or (why and display):
+            self._news.append(why)
+
+    def _open_window(self, showing: Showing) -> str:
+        """Open it; returns why the run cannot rely on it, in a sentence, or nothing."""
+        try:
+            window = WindowPlace(showing, self._served_ports)
+        except ViewerError as error:
+            return f"{str(error)[0].upper()}{str(error)[1:]}"
+        self._places.append(window)
+        return "" if window.awake else f"The viewer window has not opened within {BIRTH_S:g} s."
+
+    def _save_instead(self, path: Path, showing: Showing) -> None:
+        try:
+            path.parent.mkdir(exist_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"'{path}' cannot be written: {error.strerror}. Name another file with --save, or"
+                " none with --headless."
+            ) from None
+        self._places.insert(0, FilePlace(path, showing, index=self._index))
+        self.options = dataclasses.replace(self.options, save=path)
+
+    def _see_served(self) -> None:
+        """Wait until a stream that is to be served is served."""
+        for place, way in zip(self._places, self._ways, strict=True):
+            if isinstance(place, ServedPlace):
+                way.ready.wait(READY_S)
+                if way.failure is not None:
+                    self.close()
+                    raise way.failure
+
+    @property
+    def _served_ports(self) -> list[int]:
+        return [place.port for place in self._places if isinstance(place, ServedPlace)]
+
+    def news(self) -> list[str]:
+        """What has happened to the places since the last call, a sentence each."""
+        return [self._news.popleft() for _ in range(len(self._news))]
+
+    @property
+    def served_url(self) -> str:
+        """Address at which viewers join; empty if nothing is served, or no more."""
+        pairs = zip(self._places, self._ways, strict=True)
+        served = [p.url for p, way in pairs if isinstance(p, ServedPlace) and way.failure is None]
+        return served[0] if served else ""
+
+    def wait_ready(self) -> None:
+        """Wait until every place is open, though for none that stalls."""
+        for way in self._ways:
+            way.ready.wait(READY_S)
+
+    def show(self, item: FrameResult | SensorNote) -> None:
+        """Hand a step, or the sensor's state without one, to every place.
+
+        Raises
+        ------
+        Exception
+            What ended the file that was asked for; a viewer that is gone is no error.
+        """
+        for place, way in zip(self._places, self._ways, strict=True):
+            way.offer(item)
+            if isinstance(place, FilePlace) and way.failure is not None:
+                raise way.failure
+
+    @property
+    def file_failed(self) -> bool:
+        """Whether a file that was asked for ended before its time."""
+        pairs = zip(self._places, self._ways, strict=True)
+        return any(isinstance(place, FilePlace) and way.failure for place, way in pairs)
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Steps that each place has missed, by its name."""
+        pairs = zip(self._places, self._ways, strict=True)
+        return {place.name: place.missed + way.dropped for place, way in pairs}
+
+    def close(self) -> list[str]:
+        """Finish every place, all of them within 3 s.
+
+        Returns
+        -------
+        list of str
+            What went wrong, a sentence each.
+        """
+        never_wait_at_exit()
+        deadline_s = time.monotonic() + CLOSE_ALL_S
+        troubles = []
+        for way in self._ways:
+            if not way.finish(max(0.1, deadline_s - time.monotonic())):
+                troubles.append(f"the {way.name} had stalled and was left behind.")
+            elif way.failure is not None:
+                troubles.append(f"the {way.name} ended early: {way.failure}")
+        return self.news() + troubles
+
+
+def _application(title: str, options: ViewerOptions) -> str:
+    """Application id of a run: letters, digits, dashes; the same for the same layout only."""
+    limits = f"{options.near_mm}-{options.far_mm}" if options.near_mm or options.far_mm else ""
+    words = (APPLICATION, title, "detail" * options.detail, limits)
+    return " ".join(re.sub(r"[^A-Za-z0-9_-]+", " ", " ".join(words)).split())

@@ -1,0 +1,279 @@
+"""The viewer window: who listens on a port, finding a window that is open, starting one."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import queue
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Container
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO
+
+import rerun as rr
+
+from selective_depth.app.console.errors import ViewerError
+from selective_depth.app.settings import ViewerOptions
+from selective_depth.app.viewer.owner import SCREENS, owner_of
+
+PORTS = range(9876, 9886)
+"""Where windows and servers are looked for and put; the first is Rerun's own default."""
+PROBE_S = 0.3
+"""How long an address is tried. Where no viewer listens the SDK itself would block for 5 s
+and lose what is logged."""
+ASK_S = 3.0
+"""How long a viewer may take to say what it is; it answers between two of its pictures."""
+BIRTH_S = 5.0
+"""How long a window may take to open before the run goes on."""
+_LEAST_GAP_S = 0.05
+
+
+@dataclass(frozen=True)
+class Listener:
+    """What listens at an address.
+
+    Attributes
+    ----------
+    name : str
+        What sentences call it.
+    viewer : bool
+        Whether it is a viewer, of whatever version.
+    fits : bool
+        Whether it is a viewer of this SDK's version, which alone shows all that is logged.
+    rerun : bool
+        Whether it speaks Rerun's protocol at all, as far as is known.
+    silent : bool
+        Whether it has not answered in time.
+    """
+
+    name: str
+    viewer: bool = False
+    fits: bool = False
+    rerun: bool = True
+    silent: bool = False
+
+
+@dataclass(frozen=True)
+class Window:
+    """A viewer window, which outlives this program.
+
+    Attributes
+    ----------
+    url : str
+        Where it listens.
+    awake : bool
+        Whether it has answered; one that has not may still be opening, or never.
+    notes : tuple of str
+        What is worth telling of how it was got, a sentence each.
+    """
+
+    url: str
+    awake: bool
+    notes: tuple[str, ...] = ()
+
+
+def has_display() -> bool:
+    """Whether there may be a screen for a window; only opening one shows whether it works."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return any(os.environ.get(name) for name in SCREENS)
+
+
+def listens(address: tuple[str, int]) -> bool:
+    """Whether somebody accepts connections at an address (host, port)."""
+    try:
+        with socket.create_connection(address, PROBE_S):
+            return True
+    except OSError:
+        return False
+
+
+def local_url(port: int) -> str:
+    """A viewer's or server's address on this machine."""
+    return f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def ask(url: str, patience_s: float = ASK_S) -> Listener | None:
+    """Ask what listens at an address that accepts connections; None if it does no more.
+
+    The SDK has no limit for a listener that says nothing, so another thread asks.
+    """
+    from rerun.experimental import ViewerClient
+
+    answers: queue.SimpleQueue[str | Exception] = queue.SimpleQueue()
+
+    def wait_for_it() -> None:
+        try:
+            answers.put(ViewerClient.connect(url).get_state().viewer_version or "of no version")
+        except (OSError, RuntimeError, ValueError) as error:
+            answers.put(error)
+
+    threading.Thread(target=wait_for_it, name="asking the viewer", daemon=True).start()
+    try:
+        answer = answers.get(timeout=patience_s)
+    except queue.Empty:
+        return Listener("a program that does not answer", silent=True)
+    if isinstance(answer, str):
+        fits = answer.split(".")[:2] == rr.__version__.split(".")[:2]
+        return Listener(f"a Rerun viewer {answer}", viewer=True, fits=fits)
+    if "Unimplemented" in str(answer):
+        return Listener("a Rerun server, or an old viewer")
+    if "transport error" in str(answer):
+        return None
+    return Listener("another program", rerun=False)
+
+
+def get_window(options: ViewerOptions, taken: Container[int] = ()) -> Window:
+    """The window that is open, or a new one.
+
+    Only a viewer of this SDK's version counts as one that is open. Anything else on a port
+    (another run's server, an old viewer, another program) is left alone.
+
+    Parameters
+    ----------
+    options : ViewerOptions
+        Memory of a new one.
+    taken : container of int, optional
+        Ports that this run itself will use.
+
+    Raises
+    ------
+    ViewerError
+        If none is open and none starts, with the reason.
+    """
+    ports = [port for port in PORTS if port not in taken]
+    with ThreadPoolExecutor(len(ports)) as pool:
+        there = dict(zip(ports, pool.map(_look_at, ports), strict=True))
+    for port, listener in there.items():
+        if listener is not None and listener.fits:
+            default = ViewerOptions().viewer_memory
+            note = (
+                "The viewer window that is open is used. It keeps the memory it was started with;"
+                " close it for --viewer-memory to count."
+            )
+            notes = (note,) * (options.viewer_memory != default)
+            return Window(local_url(port), awake=True, notes=notes)
+    for port, listener in there.items():
+        if listener is None:
+            notes = tuple(
+                f"Port {other} has {it.name}; the viewer window listens on {port}."
+                for other, it in there.items()
+                if it is not None and other < port
+            )
+            return Window(local_url(port), awake=_start(port, options), notes=notes)
+    raise ViewerError(
+        f"the viewer window does not start: the ports {PORTS[0]}..{PORTS[-1]} all have other"
+        " programs. End one, or use --save FILE.rrd --headless."
+    )
+
+
+def _look_at(port: int) -> Listener | None:
+    """What is on a port of this machine; a viewer on another screen, or not ours, fits nobody."""
+    listener = ask(local_url(port)) if listens(("127.0.0.1", port)) else None
+    if listener is None or not (listener.viewer or listener.silent):
+        return listener
+    owner, ours = owner_of(port), viewer_executable()
+    if not owner.same_screen:
+        return replace(listener, name=f"{listener.name} on another screen", fits=False)
+    # A viewer that paints for seconds does not answer; that it is of our version shows its file.
+    busy = ours is not None and owner.program == Path(ours).resolve()
+    return replace(listener, fits=listener.fits or (listener.silent and busy))
+
+
+def _start(port: int, options: ViewerOptions) -> bool:
+    """Start a viewer and watch its birth; False if it lives but has not answered in time.
+
+    It is started here and not by the SDK, whose `spawn` lets everyone in the network read and
+    write, hands it this program's output (so that a pipe from here never ends), and takes 20 s
+    to notice that it died.
+    """
+    executable = viewer_executable()
+    if executable is None:
+        raise ViewerError(
+            "the viewer window does not start: there is no program 'rerun'. Install it with: pip"
+            " install --force-reinstall rerun-sdk."
+        )
+    command = [executable, "--bind", "127.0.0.1", "--port", str(port)]
+    command += ["--memory-limit", options.viewer_memory]
+    command += ["--server-memory-limit", options.serve_memory]
+    command += ["--hide-welcome-screen", "--expect-data-soon"]
+    # The file has no name and goes with the viewer; only what ends that is written to it.
+    with tempfile.TemporaryFile() as complaints:
+        try:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=complaints,
+                start_new_session=True,
+                creationflags=getattr(subprocess, "DETACHED_PROCESS", 0),
+                env={"RUST_LOG": "error"} | os.environ,
+            )
+        except OSError as error:
+            raise ViewerError(
+                f"the viewer window does not start: '{executable}': {error.strerror}."
+            ) from None
+        try:
+            return _is_born(process, port, complaints)
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+
+
+def _is_born(process: subprocess.Popen[bytes], port: int, complaints: IO[bytes]) -> bool:
+    """Wait until a viewer answers; False if it only listens after `BIRTH_S`."""
+    deadline_s = time.monotonic() + BIRTH_S
+    while (left_s := deadline_s - time.monotonic()) > 0:
+        if process.poll() is not None:
+            raise ViewerError(f"the viewer window does not start: {_reason(process, complaints)}")
+        if listens(("127.0.0.1", port)):
+            listener = ask(local_url(port), left_s)
+            if listener is not None and listener.viewer:
+                return True
+        time.sleep(_LEAST_GAP_S)
+    if listens(("127.0.0.1", port)):
+        return False
+    raise ViewerError(f"the viewer window does not start: it does not answer within {BIRTH_S:g} s.")
+
+
+def _reason(process: subprocess.Popen[bytes], complaints: IO[bytes]) -> str:
+    """Why a viewer ended, in its own last words."""
+    complaints.seek(0)
+    text = complaints.read().decode(errors="replace")
+    errors = re.findall(r"^Error: (.+)$|panicked at .*\n(.+)$", text, re.MULTILINE)
+    if errors:
+        # Without the places in its source code, which tell nobody anything here.
+        words = re.sub(r"\bos error at \S+:\d+: ", "", "".join(errors[-1])).strip()
+        return f"{words.rstrip('.')}."
+    if process.returncode < 0:
+        return f"it was ended by signal {-process.returncode}."
+    return f"it ended with exit code {process.returncode}."
+
+
+def viewer_executable() -> str | None:
+    """The viewer that came with the SDK, else the first on the PATH; None without any."""
+    package = importlib.util.find_spec("rerun_cli")
+    if package is not None and package.origin is not None:
+        folder = Path(package.origin).parent
+        bundle = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"  # on macOS
+        for native in (bundle, folder / "rerun", folder / "rerun.exe"):
+            if native.is_file():
+                return str(native)
+    return shutil.which("rerun")
+
+
+def join_command(url: str) -> str:
+    """What to type to see a served stream; with its folder where `rerun` alone is not this one."""
+    ours, on_path = Path(sys.executable).with_name("rerun"), shutil.which("rerun")
+    plain = not ours.is_file() or (on_path is not None and ours.samefile(on_path))
+    return f"{'rerun' if plain else ours} --connect {url}"
