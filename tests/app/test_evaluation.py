@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
-from selective_depth.app.cli import FAILED, MISUSED, OK, run
+from selective_depth.app.cli import run
 from selective_depth.app.commands.model import save_cloud, save_depth, save_model
 from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.exit_codes import FAILED, MISUSED, OK
 from selective_depth.app.evaluation import evaluate as protocol
 from selective_depth.app.evaluation.evaluate import Errors, Outcome, errors_of, outcomes, summarise
 from selective_depth.app.evaluation.report import comparison, print_results, to_markdown
