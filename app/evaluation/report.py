@@ -23,7 +23,6 @@ from selective_depth.app.console.progress import FrameProgress
 from selective_depth.app.evaluation.evaluate import (
     Outcome,
     Results,
-    errors_of,
     frames_of,
     outcomes,
     summarise,
@@ -45,6 +44,7 @@ from selective_depth.app.pictures.stills import (
 from selective_depth.app.pipeline import say
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import acquire, shots_of
+from selective_depth.selectors.quality import errors_of
 from selective_depth.selectors.reconstruct import reconstruct
 
 SHOWN = ("uniform", "improvement", "gradient", "step", "loop", "oracle")
@@ -166,7 +166,7 @@ def _shots_image(frame: DepthFrame, name: str, case: Case) -> tuple[Image, Image
     """Where a strategy shot, its error map, its RMSE and MAE."""
     image = _backdrop(frame)
     if name == "loop":
-        acquisition = acquire(frame.measure, case.seeds, case.shots, case.rounds)
+        acquisition = acquire(frame.measure, case.seeds, rounds=case.rounds, shots=case.shots)
         uv, order = acquisition.uv, acquisition.round.astype(int)
     else:
         uv = STRATEGIES[name].pixels(case)
@@ -176,7 +176,7 @@ def _shots_image(frame: DepthFrame, name: str, case: Case) -> tuple[Image, Image
     steps = np.linspace(0, len(ROUND_COLOURS) - 1, max(int(order.max(initial=1)), 1)).astype(int)
     image[uv[taken, 1], uv[taken, 0]] = ROUND_COLOURS[steps[order[taken] - 1]]
     model_mm = reconstruct(uv, frame.measure(uv), frame.shape)
-    rmse_mm, mae_mm, _ = errors_of(model_mm, frame)
+    rmse_mm, mae_mm, _ = errors_of(model_mm, frame.depth_mm)
     error_mm = np.abs(model_mm - frame.depth_mm.astype(np.float32))
     # Some errors are a metre, most a millimetre: brightness follows the root.
     shade = _coloured(np.sqrt(error_mm / ERROR_LIMIT_MM), cv2.COLORMAP_INFERNO)
