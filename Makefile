@@ -6,7 +6,7 @@ QUICK := not slow and not hardware and not browser
 TEST_PACKAGES := libopenni2-0 libopenni2-dev g++ libvulkan1 mesa-vulkan-drivers
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-slow lint format system-packages recordings pictures wheel wheel-check clean
+.PHONY: help typing run test test-slow lint format system-packages recordings pictures wheel wheel-check docs hooks clean
 
 help: ## Show this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -37,13 +37,24 @@ test-slow: $(VENV)/.tests-installed ## Run the long forms: fuzzing, soak, hundre
 	@.ci/system-packages $(TEST_PACKAGES)
 	@$(BIN)/python -m pytest -m slow
 
-lint: $(VENV)/.tests-installed ## Check style, types and the import contract
+typing: # the three folders as one package, for tools that read code without importing it
 	@mkdir -p .typing/selective_depth
 	@for room in app drivers selectors; do ln -sfn ../../$$room .typing/selective_depth/$$room; done
+
+lint: $(VENV)/.tests-installed typing ## Check style, types and the import contract
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@PYTHONPATH=.typing $(BIN)/lint-imports --no-cache --no-logo
+
+docs: $(VENV)/.installed typing ## Make the documentation and the API reference: out/docs/index.html
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@$(BIN)/mkdocs build --quiet --config-file .mkdocs.yml
+	@echo "wrote out/docs/index.html"
+
+hooks: $(VENV)/.tests-installed ## Check style and types at every commit, with pre-commit
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check pre-commit
+	@$(BIN)/pre-commit install
 
 format: $(VENV)/.tests-installed ## Put the code in its standard form
 	@$(BIN)/ruff check --fix .

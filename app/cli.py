@@ -28,6 +28,7 @@ from selective_depth.app.settings import (
     Flag,
     GasOptions,
     ImprovementOptions,
+    PictureOptions,
     SeedOptions,
     Settings,
     optional,
@@ -49,7 +50,8 @@ EXAMPLES = (
 Source = Annotated[str, arg(metavar="SOURCE")]
 SourceOrSample = Annotated[str | None, optional("SOURCE")]
 Options = Annotated[Settings, arg(name="")]
-DEFAULTS = Settings()
+Page = Annotated[PictureOptions, arg(name="")]
+DEFAULTS, PAGE = Settings(), PictureOptions()
 
 
 @command(
@@ -258,15 +260,15 @@ def screenshot(
     frame : int
         The frame to show; by default the last.
     """
-    from selective_depth.app.console.output import check_picture, write_picture
+    from selective_depth.app.console.output import IMAGES, check_picture, write_image
     from selective_depth.app.console.progress import waiting
     from selective_depth.app.pipeline import say
     from selective_depth.app.viewer import recording as viewer
 
-    check_picture(picture)
+    check_picture(picture, IMAGES)
     with waiting("Loading it into the viewer"):
         taken = viewer.screenshot(recording, frame)
-    write_picture(picture, taken)
+    write_image(picture, taken)
     say(f"wrote {picture}")
     return OK
 
@@ -289,19 +291,22 @@ def snapshot(
     gas: GasOptions = DEFAULTS.gas,
     improvement: ImprovementOptions = DEFAULTS.improvement,
     acquire: Annotated[AcquireOptions, arg(name="")] = DEFAULTS.acquire,
+    page: Page = PAGE,
 ) -> None:
-    """Write a contact sheet of one frame of each source, and every panel alone, as PNG.
+    """Write a contact sheet of one frame of each source, and every panel alone.
 
     Parameters
     ----------
     sources : tuple of str
         Recordings, folders or scenes, as for replay; one row of the sheet each.
     out : Path
-        Folder for the pictures.
+        Folder for the sheet and every panel as .png; or a picture, for the sheet alone.
     frame : int
         Which frame of each source, from 0.
     seeds, gas, improvement, acquire
         Options of the selectors.
+    page
+        The page.
     """
     from selective_depth.app.commands.snapshot import snapshot as make_stills
     from selective_depth.app.console.progress import waiting
@@ -310,8 +315,9 @@ def snapshot(
         raise UsageError(f"--frame is {frame}; frames count from 0.")
     settings = Settings(seeds=seeds, gas=gas, improvement=improvement, acquire=acquire)
     with waiting("Running both selectors"):
-        written = make_stills(sources, frame, out, settings)
-    print(f"wrote {written[0]} and {len(written) - 1} single panels beside it")
+        written = make_stills(sources, frame, out, settings, page)
+    beside = f" and {len(written) - 1} single panels beside it" if written[1:] else ""
+    print(f"wrote {written[0]}{beside}")
 
 
 @command(
@@ -326,6 +332,7 @@ def epochs(
     save: Annotated[Path | None, optional("FILE.rrd")] = None,
     frame: Annotated[int, arg(metavar="N")] = 0,
     seed: Annotated[int, arg(metavar="N")] = 0,
+    page: Page = PAGE,
 ) -> int:
     """Show neural gas after 5, 10, 25, 40, 60 and 100 epochs of one frame.
 
@@ -334,17 +341,19 @@ def epochs(
     source : str
         An object as .ply, or anything else that 'replay' takes.
     out : Path
-        The picture to make, .png or .webp.
+        The picture to make, .png, .webp, .pdf or .svg.
     save : Path
         Write a Rerun recording as well, by epoch.
     frame : int
         Which frame of the source, from 0.
     seed : int
         Seed of the random draws.
+    page
+        The page.
     """
     from selective_depth.app.commands.figures import draw_epochs
 
-    return draw_epochs(source, out, save=save, number=frame, seed=seed)
+    return draw_epochs(source, out, save=save, number=frame, seed=seed, page=page)
 
 
 @command(
@@ -358,6 +367,7 @@ def densities(
     frame: Annotated[int, arg(metavar="N")] = 0,
     epochs: Annotated[int, arg(metavar="N")] = 50,
     seed: Annotated[int, arg(metavar="N")] = 0,
+    page: Page = PAGE,
 ) -> int:
     """Show what neural gas finds from first scans of 32x32, 40x40, 64x64 and 75x75 points.
 
@@ -366,17 +376,19 @@ def densities(
     source : str
         An object as .ply, or anything else that 'replay' takes.
     out : Path
-        The picture to make, .png or .webp.
+        The picture to make, .png, .webp, .pdf or .svg.
     frame : int
         Which frame of the source, from 0.
     epochs : int
         Training length.
     seed : int
         Seed of the random draws.
+    page
+        The page.
     """
     from selective_depth.app.commands.figures import draw_densities
 
-    return draw_densities(source, out, number=frame, epochs=epochs, seed=seed)
+    return draw_densities(source, out, number=frame, epochs=epochs, seed=seed, page=page)
 
 
 @command(
@@ -464,6 +476,7 @@ def evaluate(
     json: Annotated[Path | None, optional("FILE")] = None,
     picture: Annotated[Path | None, optional("FILE.png")] = None,
     page: Annotated[Path | None, optional("FILE.md")] = None,
+    format_: Page = PAGE,
 ) -> None:
     """Compare ways of choosing measurements: how good a model does a budget buy?
 
@@ -490,7 +503,9 @@ def evaluate(
     page : Path
         Write the tables in Markdown.
     picture : Path
-        Write where each strategy shot and how wrong its model is, for the first frame.
+        Draw where each strategy measured and how wrong its model is, for the first frame.
+    format_
+        The picture's page.
     """
     from selective_depth.app.evaluation.report import run_evaluation
 
@@ -506,6 +521,7 @@ def evaluate(
         json_file=json,
         picture=picture,
         page=page,
+        format_=format_,
     )
 
 

@@ -107,8 +107,18 @@ class ViewerOptions:
 
 
 @dataclass(frozen=True)
+class PictureOptions:
+    """Pictures; their format is that of the file's ending: .png, .webp, .pdf or .svg."""
+
+    dpi: int = 100
+    """Pixels per inch."""
+    width: float = 16.0
+    """Width of the page in inches; type and lines grow with it."""
+
+
+@dataclass(frozen=True)
 class Settings:
-    """All of it."""
+    """All options of a run."""
 
     seeds: SeedOptions = field(default_factory=SeedOptions)
     gas: GasOptions = field(default_factory=GasOptions)

@@ -11,35 +11,28 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from kinect_residuals import plane_residuals
+from matplotlib.figure import Figure
 
-from selective_depth.app.console.output import write_picture
-from selective_depth.app.pictures.stills import GAP, Panel, depth_panel, finished
+from selective_depth.app.pictures import Panel, sheet, write_picture
+from selective_depth.app.pictures.panels import depth_panel
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.virtual.scenes import SCENES
 
 ROOT = Path(__file__).parent.parent
 PICTURE = ROOT / "app" / "docs" / "pictures" / "virtual-kinect.png"
-WIDTH = 248
 
 
-def panel(uri: str, caption: str) -> npt.NDArray[np.uint8]:
+def panel(uri: str, caption: str) -> Panel:
     with open_source(uri) as source:
-        made = depth_panel(source.read())
-    return finished(
-        Panel(made.name, caption, made.image, made.colormap, made.limits, made.note), WIDTH
-    )
+        return depth_panel(source.read(), caption)
 
 
-def picture() -> npt.NDArray[np.uint8]:
+def picture() -> Figure:
     rows = []
     for noise, told in (("off", "exact"), ("kinect", "as sensed")):
-        parts = [
-            panel(f"virtual:{scene}?seed=7&noise={noise}", f"{scene}, {told}") for scene in SCENES
-        ]
-        rows.append(np.hstack([cv2.copyMakeBorder(
-            part, 0, 0, 0, GAP, cv2.BORDER_CONSTANT, value=(255, 255, 255)
-        ) for part in parts]))  # fmt: skip
-    return np.asarray(np.vstack(rows)[:, :-GAP], np.uint8)
+        uris = {scene: f"virtual:{scene}?seed=7&noise={noise}" for scene in SCENES}
+        rows.append(("", [panel(uri, f"{scene}, {told}") for scene, uri in uris.items()]))
+    return sheet(rows, legend=False)
 
 
 def row(name: str, frames: list[npt.NDArray[np.uint16]]) -> str:
@@ -56,7 +49,7 @@ def row(name: str, frames: list[npt.NDArray[np.uint16]]) -> str:
 
 
 def main() -> None:
-    write_picture(PICTURE, picture())
+    write_picture(PICTURE, picture(), dpi=60)
     print("| frames | error, steps | likeness 1, 2, 3 px apart | holes a frame | pixels lost |")
     print("|---|---|---|---|---|")
     real = sorted((ROOT.parent / "shared" / "data" / "sequence").glob("*.png"))[::10]

@@ -5,8 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -14,20 +16,21 @@ import numpy.typing as npt
 
 from selective_depth.app.commands.snapshot import nth_frame
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.output import check_picture, write_output, write_picture
+from selective_depth.app.console.exit_codes import OK
+from selective_depth.app.console.output import check_output, check_picture, write_output
 from selective_depth.app.console.progress import waiting
-from selective_depth.app.pictures.stills import (
-    GAP,
-    INK,
-    NODE,
-    PALE,
-    PAPER,
-    Image,
-    text_width,
-    write_text,
+from selective_depth.app.pictures import Panel, sheet, write_picture
+from selective_depth.app.pictures.palette import Image
+from selective_depth.app.pictures.panels import (
+    backdrop,
+    draw_kept_triangles,
+    draw_nodes,
+    tinted,
+    with_holes,
 )
+from selective_depth.app.pictures.sheets import WIDTH_IN, Row
 from selective_depth.app.pipeline import say
-from selective_depth.drivers.errors import OutputError
+from selective_depth.app.settings import PictureOptions
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
 from selective_depth.selectors.neural_gas import (
@@ -39,6 +42,9 @@ from selective_depth.selectors.neural_gas import (
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.seeds import SeedGrid
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 EPOCHS = (5, 10, 25, 40, 60, 100)
 """Training lengths of Fig. 1."""
 FIRST_POINTS, FIRST_NODES = 4200, 45 * 50
@@ -49,10 +55,7 @@ METRICS: tuple[EdgeMetric, EdgeMetric] = ("3d", "image")
 TABLE_NODES = (700, 1400, 2800, 5600)
 TABLE_EPOCHS = (5, 10, 20, 50, 100)
 
-_NAMES = {"3d": "short in space", "image": "short in the image"}
-_PANEL_WIDTH = 215
-_AREA = (92, 64, 34)
-_OBJECT = np.array((222, 219, 216), dtype=np.uint8)
+_NAMES = {"3d": "edges short in space", "image": "edges short in the image"}
 
 
 def object_seeds(frame: DepthFrame, points: int) -> SeedGrid:
@@ -126,7 +129,8 @@ def epochs_figure(
     frame: DepthFrame,
     seeds: SeedGrid,
     trained: Sequence[tuple[int, dict[EdgeMetric, RegionSelection]]],
-) -> Image:
+    width_in: float = WIDTH_IN,
+) -> Figure:
     """Fig. 1 of the paper: nodes and areas of interest after trainings of several lengths.
 
     Parameters
@@ -137,18 +141,15 @@ def epochs_figure(
         Its first scan.
     trained : sequence
         What `epoch_selections` yielded.
-
-    Returns
-    -------
-    uint8 array of shape (height, width, 3)
-        Blue-green-red.
+    width_in : float, default 16
+        Width of the page in inches.
     """
     columns = [
         (f"{length} epochs", f"error {chosen['3d'].quantisation_error_mm:.1f} mm", chosen)
         for length, chosen in trained
     ]
     nodes = len(trained[0][1]["3d"].nodes_mm)
-    return _figure(frame, f"{len(seeds.uv):,} points, {nodes:,} nodes", columns)
+    return _figure(frame, f"{len(seeds.uv):,} points, {nodes:,} nodes", columns, width_in)
 
 
 def densities_figure(
@@ -156,8 +157,11 @@ def densities_figure(
     sides: Sequence[int] = DENSITIES,
     epochs: int = 50,
     seed: int = 0,
-) -> Image:
+    width_in: float = WIDTH_IN,
+) -> Figure:
     """Fig. 2 of the paper: areas of interest from first scans of several densities.
+
+    Nodes are as many per point as in Fig. 1.
 
     Parameters
     ----------
@@ -169,11 +173,8 @@ def densities_figure(
         Training length, in the middle of the paper's best range.
     seed : int, default 0
         Seed of the random draws.
-
-    Returns
-    -------
-    uint8 array of shape (height, width, 3)
-        Blue-green-red. Nodes are as many per point as in Fig. 1.
+    width_in : float, default 16
+        Width of the page in inches.
     """
     columns = []
     for side in sides:
@@ -181,93 +182,49 @@ def densities_figure(
         nodes = max(1, round(len(seeds.uv) * FIRST_NODES / FIRST_POINTS))
         chosen = by_metric(NeuralGasSelector(nodes, epochs, "exact", seed).select(seeds))
         columns.append((f"{side} × {side}", f"{len(seeds.uv):,} points, {nodes:,} nodes", chosen))
-    return _figure(frame, f"{epochs} epochs", columns)
+    return _figure(frame, f"{epochs} epochs", columns, width_in)
 
 
 def _figure(
     frame: DepthFrame,
     note: str,
     columns: Sequence[tuple[str, str, dict[EdgeMetric, RegionSelection]]],
-) -> Image:
+    width_in: float,
+) -> Figure:
     """The object, then a column per training: nodes above, kept triangles by each metric below."""
-    shown = [_column("Object", note, [_shaded(frame)])]
-    for title, words, chosen in columns:
-        panels = [_nodes_panel(frame, chosen["3d"])]
-        panels += [_areas_panel(frame, chosen[metric]) for metric in METRICS]
-        shown.append(_column(title, words, panels))
-    height = max(column.shape[0] for column in shown)
-    out = np.full((height + 2 * GAP, (_PANEL_WIDTH + GAP) * len(shown) + GAP, 3), PAPER, np.uint8)
-    for place, column in enumerate(shown):
-        left = GAP + place * (_PANEL_WIDTH + GAP)
-        out[GAP : GAP + column.shape[0], left : left + _PANEL_WIDTH] = column
-    panel = (height - 58) // 3
-    for row, name in enumerate(("nodes", *(f"kept: {_NAMES[metric]}" for metric in METRICS))):
-        if row:
-            write_text(out, name, GAP, GAP + 58 + row * panel + panel // 2, 17, colour=INK)
-    foot = out.shape[0] - GAP
-    cv2.circle(out, (GAP + 6, foot - 6), 3, NODE, -1, cv2.LINE_AA)
-    write_text(out, "neural gas node", GAP + 18, foot, 15, colour=PALE)
-    return out
-
-
-def _column(title: str, note: str, panels: Sequence[Image]) -> Image:
-    head = np.full((58, _PANEL_WIDTH, 3), PAPER, np.uint8)
-    for text, baseline, size, weight, colour in (
-        (title, 22, 19, 600, INK),
-        (note, 44, 13, 400, PALE),
-    ):
-        left = (_PANEL_WIDTH - text_width(text, size, weight)) // 2
-        write_text(head, text, left, baseline, size, weight=weight, colour=colour)
-    height = round(panels[0].shape[0] * _PANEL_WIDTH / panels[0].shape[1])
-    fitted = [
-        cv2.resize(panel, (_PANEL_WIDTH, height), interpolation=cv2.INTER_AREA) for panel in panels
+    first = Panel("object", "Object", _shaded(frame), note=note)
+    nodes = [
+        Panel(
+            "nodes",
+            title,
+            backdrop(frame),
+            note=words,
+            overlay=partial(draw_nodes, regions=by["3d"]),
+        )
+        for title, words, by in columns
     ]
-    return np.vstack([head, *fitted])
+    rows: list[Row] = [("Nodes of the neural gas", [first, *nodes])]
+    for metric in METRICS:
+        kept = [
+            Panel("kept", title, tinted(backdrop(frame), by[metric].mask),
+                  note=f"{by[metric].mask.mean():.0%} of the frame",
+                  overlay=partial(draw_kept_triangles, regions=by[metric]))
+            for title, _, by in columns
+        ]  # fmt: skip
+        rows.append((f"Triangles kept: {_NAMES[metric]}", [None, *kept]))
+    return sheet(rows, width_in, legend=False)
 
 
 def _shaded(frame: DepthFrame) -> Image:
     """The object lit from the upper left."""
-    depth = frame.depth_mm.astype(np.float32)
-    smooth = cv2.GaussianBlur(depth, (0, 0), 1.5)
-    right, down = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8
-    # Slopes in mm per mm: a pixel is depth / focal length wide.
-    per_mm = frame.camera.fx / np.maximum(depth, 1)
-    light = (0.5 * right * per_mm + 0.6 * down * per_mm + 1) / np.sqrt(
-        1 + (right * per_mm) ** 2 + (down * per_mm) ** 2
-    )
-    grey = np.clip(90 + 105 * light, 40, 250).astype(np.uint8)
-    image = np.repeat(grey[:, :, None], 3, axis=2)
-    image[frame.depth_mm == 0] = PAPER
-    return image
+    from matplotlib.colors import LightSource
 
-
-_SCALE = 2  # nodes and edges are finer than the pixels of the frame
-
-
-def _canvas(frame: DepthFrame) -> Image:
-    image = np.full((*frame.shape, 3), PAPER, np.uint8)
-    image[frame.depth_mm > 0] = _OBJECT
-    return np.repeat(np.repeat(image, _SCALE, axis=0), _SCALE, axis=1)
-
-
-def _nodes_panel(frame: DepthFrame, selection: RegionSelection) -> Image:
-    image = _canvas(frame)
-    for u, v in _on_canvas(selection.nodes_uv):
-        cv2.circle(image, (int(u), int(v)), 36, NODE, -1, cv2.LINE_AA, 4)
-    return image
-
-
-def _areas_panel(frame: DepthFrame, selection: RegionSelection) -> Image:
-    image = _canvas(frame)
-    corners = _on_canvas(selection.nodes_uv)[selection.triangles]
-    image[np.repeat(np.repeat(selection.mask, _SCALE, axis=0), _SCALE, axis=1)] = _AREA
-    cv2.polylines(image, list(corners[selection.kept]), True, (150, 122, 96), 1, cv2.LINE_AA, 4)
-    return image
-
-
-def _on_canvas(uv: npt.NDArray[np.float32]) -> npt.NDArray[np.int32]:
-    """Pixels of the frame as OpenCV's sixteenths of a pixel of the canvas."""
-    return np.round(((uv + 0.5) * _SCALE - 0.5) * 16).astype(np.int32)
+    known = frame.depth_mm > 0
+    mm_per_pixel = float(np.median(frame.depth_mm[known])) / frame.camera.fx if known.any() else 1
+    near_mm = -cv2.GaussianBlur(frame.depth_mm.astype(np.float32), (0, 0), 1.5)
+    light = LightSource(315, 45).hillshade(near_mm, dx=mm_per_pixel, dy=mm_per_pixel)
+    grey = (60 + 190 * light).astype(np.uint8)
+    return with_holes(np.repeat(grey[:, :, None], 3, axis=2), ~known)
 
 
 @dataclass(frozen=True)
@@ -373,7 +330,9 @@ def table_markdown(rows: Sequence[TableRow]) -> str:
 # The commands
 
 
-def draw_epochs(source: str, out: Path, *, save: Path | None, number: int, seed: int) -> int:
+def draw_epochs(
+    source: str, out: Path, *, save: Path | None, number: int, seed: int, page: PictureOptions
+) -> int:
     """Make Fig. 1 of a frame of a source, and a Rerun recording of it; returns the exit code.
 
     Raises
@@ -381,32 +340,35 @@ def draw_epochs(source: str, out: Path, *, save: Path | None, number: int, seed:
     OutputError
         If a file cannot be written.
     UsageError
-        If the picture is of a kind that cannot be made, or there is no such frame.
+        If the picture is of a format that cannot be made, or there is no such frame.
     """
     check_picture(out)
+    check_output(save)
     frame = nth_frame(source, number)
     seeds = object_seeds(frame, FIRST_POINTS)
     with waiting(f"training {len(EPOCHS)} times"):
         trained = list(epoch_selections(seeds, EPOCHS, FIRST_NODES, seed))
-    write_picture(out, epochs_figure(frame, seeds, trained))
+    write_picture(out, epochs_figure(frame, seeds, trained, page.width), page.dpi)
     say(f"wrote {out}")
     if save is not None:
         from selective_depth.app.viewer import save_trainings
 
         save_trainings(save, frame, ((length, chosen["3d"]) for length, chosen in trained))
         say(f"wrote {save}; open it with 'rerun {save}'")
-    return 0
+    return OK
 
 
-def draw_densities(source: str, out: Path, *, number: int, epochs: int, seed: int) -> int:
+def draw_densities(
+    source: str, out: Path, *, number: int, epochs: int, seed: int, page: PictureOptions
+) -> int:
     """Make Fig. 2 of a frame of a source; returns the exit code. Raises as `draw_epochs`."""
     check_picture(out)
     frame = nth_frame(source, number)
     with waiting(f"training {len(DENSITIES)} times"):
-        figure = densities_figure(frame, DENSITIES, epochs, seed)
-    write_picture(out, figure)
+        figure = densities_figure(frame, DENSITIES, epochs, seed, page.width)
+    write_picture(out, figure, page.dpi)
     say(f"wrote {out}")
-    return 0
+    return OK
 
 
 def tabulate_nodes(source: str, *, every: int | None, out: Path | None) -> int:
@@ -417,13 +379,15 @@ def tabulate_nodes(source: str, *, every: int | None, out: Path | None) -> int:
     OutputError
         If the file cannot be written.
     UsageError
-        If `every` is not allowed.
+        If the source has no frame, or never ends and `every` is given.
     """
-    if every is not None and every < 1:
-        raise UsageError(f"--every is {every}; it must be 1 or more.")
-    if out is not None and not out.resolve().parent.is_dir():
-        raise OutputError(f"'{out}' cannot be written: its folder does not exist.")
+    check_output(out)
     with open_source(source) as opened:
+        if every is not None and opened.frame_count is None:
+            raise UsageError(
+                f"'{source}' never ends; record some of it first, or leave out --every to take"
+                " its first frame."
+            )
         frames = list(islice(opened, 0, None if every else 1, every or 1))
     if not frames:
         raise UsageError(f"'{source}' has no frame to tabulate.")
@@ -435,4 +399,4 @@ def tabulate_nodes(source: str, *, every: int | None, out: Path | None) -> int:
     say(table)
     if out is not None:
         write_output(out, table)
-    return 0
+    return OK

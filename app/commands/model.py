@@ -9,12 +9,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.app.console.output import cannot_write, write_output
-from selective_depth.app.pictures.stills import ROUND_COLOURS
+from selective_depth.app.console.output import make_folder, write_output
+from selective_depth.app.pictures import palette
 from selective_depth.drivers.frame import Camera
 from selective_depth.selectors.acquire import Acquisition
-
-SEED_GREY = (150, 150, 150)
 
 
 def save_cloud(path: Path, acquisition: Acquisition, camera: Camera) -> int:
@@ -50,10 +48,8 @@ def save_cloud(path: Path, acquisition: Acquisition, camera: Camera) -> int:
     )
     vertex["xyz"] = camera.points_mm(acquisition.uv[kept], acquisition.depth_mm[kept])
     vertex["round"] = rounds
-    last = max(int(acquisition.round.max(initial=1)), 1)
-    steps = np.linspace(0, len(ROUND_COLOURS) - 1, last).astype(int)
-    colours = np.vstack((SEED_GREY, ROUND_COLOURS[steps][:, ::-1]))
-    vertex["rgb"] = colours[rounds]
+    last = int(acquisition.round.max(initial=1))
+    vertex["rgb"] = palette.channels(palette.round_colours(last))[rounds]
     header = "\n".join(
         (
             "ply",
@@ -112,10 +108,7 @@ def save_model(folder: Path, acquisition: Acquisition, camera: Camera) -> list[P
     OutputError
         If a file cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
+    make_folder(folder)
     cloud, depth, samples = (folder / n for n in ("cloud.ply", "depth.png", "samples.npz"))
     save_cloud(cloud, acquisition, camera)
     save_depth(depth, acquisition.reconstruct())

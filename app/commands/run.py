@@ -1,4 +1,4 @@
-"""A run from its source to its report: where source, loop and viewer meet."""
+"""A run from its source to its report: where source, pipeline and viewer meet."""
 
 from __future__ import annotations
 
@@ -8,36 +8,29 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.output import write_picture
 from selective_depth.app.console.progress import FrameProgress, waiting
-from selective_depth.app.pictures.stills import StillRow, contact_sheet
+from selective_depth.app.pictures import StillRow, contact_sheet, write_picture
 from selective_depth.app.pipeline import (
-    Arrival,
-    Loop,
+    Feed,
+    FrameResult,
+    Pipeline,
     RunReport,
-    StateNote,
-    Step,
-    count_samples,
+    SensorNote,
     is_settings,
     print_report,
     save_settings,
     say,
+    state_of,
 )
 from selective_depth.app.settings import Settings, ViewerOptions
 from selective_depth.app.viewer import Viewer, has_display
-from selective_depth.drivers.errors import (
-    DamagedRecordingError,
-    DeviceLostError,
-    OutputError,
-    SourceEndedError,
-    SourceTimeoutError,
-)
+from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.realtime import RealtimeSource
@@ -50,8 +43,6 @@ log = logging.getLogger(__name__)
 OK, FAILED, INTERRUPTED = 0, 1, interrupt.EXIT_CODE
 MEMORY = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%", re.IGNORECASE)
 """A size as the SDK reads it."""
-POLL_S = 0.5
-"""How long a live sensor may be silent before its state is shown."""
 
 
 def watch(uri: str, settings: Settings) -> int:
@@ -160,17 +151,18 @@ class Session:
     ----------
     report : RunReport
         What it has come to.
-    last : Step or None
-        The last step.
+    last : FrameResult or None
+        The last result.
     """
 
     def __init__(self, uri: str, settings: Settings) -> None:
         self.settings = settings
         self.report = RunReport(uri, live=False)
         self._uri = uri
-        self.last: Step | None = None
+        self.last: FrameResult | None = None
         self._code = OK
         self._ready_s = 0.0
+        self._recent_s: deque[float] = deque(maxlen=31)
 
     def run(self) -> int:
         """Run to the end of the source, the asked number of frames, or Ctrl-C.
@@ -190,14 +182,14 @@ class Session:
             _tell(source)
             seen = _with_a_place(self.settings.viewer, self._uri)
             self.settings = dataclasses.replace(self.settings, viewer=seen)
-            loop = stack.enter_context(Loop(self.settings, realtime=source.live))
+            pipeline = stack.enter_context(Pipeline(self.settings, realtime=source.live))
             frames = _frames_in_all(self.settings.run.frames, source.frame_count)
-            viewer = Viewer(seen, live=source.live, times=loop.times, frames=frames)
+            viewer = Viewer(seen, live=source.live, times=pipeline.times, frames=frames)
             if seen.serve:
                 say(f"Serving on {seen.serve_address}; join with 'rerun {viewer.served_url}'.")
             try:
-                with interrupt.recognised():
-                    self._turn_all(source, loop, viewer)
+                with interrupt.recognised(), FrameProgress(self._uri, frames) as progress:
+                    self._flow(source, pipeline, viewer, progress)
                 if seen.serve and not report.live:
                     say("All frames are served; Ctrl-C ends.")
                     threading.Event().wait()
@@ -208,88 +200,75 @@ class Session:
                 if viewer.file_failed and self._code == OK:
                     self._code = FAILED
                 report.missed = viewer.dropped
-                report.state = _state(source)
+                report.state = state_of(source)
                 report.dropped = source.dropped - report.dropped_starting
-                report.stages = loop.times.summary()
+                report.stages = pipeline.times.summary()
             if seen.save is not None and self.last is not None:
                 self._write_beside(seen.save, picture=not viewer.window)
         return self._code
 
-    def _turn_all(self, source: DepthSource, loop: Loop, viewer: Viewer) -> None:
-        total = _frames_in_all(self.settings.run.frames, source.frame_count)
-        recent: deque[float] = deque(maxlen=31)
-        with FrameProgress(self._uri, total) as progress:
-            for step in loop.steps(self._frames(source, loop, viewer, progress)):
-                if not recent:
-                    recent.append(self._ready_s)
-                recent.append(time.monotonic())
-                fps = (len(recent) - 1) / (recent[-1] - recent[0])
-                self._show(step, fps, source, loop, viewer)
-                self.report.seconds = time.monotonic() - self._ready_s
-                progress.update(self.report.frames, f"{fps:.0f} frames/s")
+    def _flow(
+        self, source: DepthSource, pipeline: Pipeline, viewer: Viewer, progress: FrameProgress
+    ) -> None:
+        """Source to pipeline to result to sinks, one frame after the other."""
+        feed = Feed(source, self.settings.run.frames)
+        state, taken = state_of(source), 0
 
-    def _frames(
-        self, source: DepthSource, loop: Loop, viewer: Viewer, progress: FrameProgress
-    ) -> Iterator[Arrival | None]:
-        """As many frames as asked for; None when a sensor is silent.
+        def hand_on(results: Iterable[FrameResult]) -> None:
+            for result in results:
+                self._show(result, source, pipeline, viewer)
+                progress.update(self.report.frames, f"{result.figures['fps']:.0f} frames/s")
 
-        The first is handed on when everything is ready.
-        """
-        state, taken = _state(source), 0
-        while taken != self.settings.run.frames:
-            interrupt.check()
-            frame, own_ms = None, dict[str, float]()
-            try:
-                with loop.times.stage("read", own_ms):
-                    frame = source.read(POLL_S) if source.live else source.read()
-            except SourceEndedError:
-                return
-            except DamagedRecordingError as error:
-                self.report.troubles.append(str(error))
-                self._code = FAILED
-                return
-            except (SourceTimeoutError, DeviceLostError):
-                if not source.live:
-                    raise
-                viewer.show(StateNote(_state(source)))
-            if _state(source) != state:
-                state = _state(source)
+        for read in feed:
+            if read.state != state:
+                state = read.state
                 reason = getattr(source, "state_reason", "")
                 progress.say(f"sensor {state}{': ' if reason else ''}{reason}")
-            if frame is None:
-                yield None
+            if read.frame is None:
+                viewer.show(SensorNote(state))
+                hand_on(pipeline.rest())
                 continue
             if taken == 0:
-                self._get_ready(frame, loop, viewer)
+                self._get_ready(read.frame, pipeline, viewer)
             elif taken == 1:
                 self.report.dropped_starting = source.dropped
             taken += 1
-            yield Arrival(frame, state, own_ms["read"])
+            pipeline.begin(read.frame, state=state, read_ms=read.read_ms)
+            hand_on(pipeline.finished())
+        if feed.damage is not None:
+            self.report.troubles.append(str(feed.damage))
+            self._code = FAILED
+        hand_on(pipeline.rest())
 
-    def _get_ready(self, frame: DepthFrame, loop: Loop, viewer: Viewer) -> None:
+    def _get_ready(self, frame: DepthFrame, pipeline: Pipeline, viewer: Viewer) -> None:
         began_s = time.monotonic()
         with waiting("Compiling for this machine; the next run starts at once"):
-            loop.warm_up(frame)
+            pipeline.warm_up(frame)
             viewer.wait_ready()
         self._ready_s = time.monotonic()
+        self._recent_s.append(self._ready_s)
         log.info("ready after %.1f s", self._ready_s - began_s)
 
     def _show(
-        self, step: Step, fps: float, source: DepthSource, loop: Loop, viewer: Viewer
+        self, result: FrameResult, source: DepthSource, pipeline: Pipeline, viewer: Viewer
     ) -> None:
-        self.report.take(step)
-        self.last = step
-        figures = {
-            "fps": fps,
-            "dropped_sensor": source.dropped,
-            "dropped_viewer": sum(viewer.dropped.values()),
-            "samples": count_samples(step),
-            "quantisation_error_mm": step.regions.quantisation_error_mm,
-        }
-        if step.model is not None:
-            figures["rmse_mm"] = step.model.rmse_mm
-        stages_ms = loop.times.last_ms() | step.stages_ms
-        viewer.show(dataclasses.replace(step, stages_ms=stages_ms, figures=figures))
+        """Add what only the run knows of a result, and hand it to report and viewer."""
+        now_s = time.monotonic()
+        self._recent_s.append(now_s)
+        result.figures.update(
+            fps=(len(self._recent_s) - 1) / (now_s - self._recent_s[0]),
+            dropped_sensor=source.dropped,
+            dropped_viewer=sum(viewer.dropped.values()),
+            samples=result.samples,
+            quantisation_error_mm=result.regions.quantisation_error_mm,
+        )
+        if result.model is not None:
+            result.figures["rmse_mm"] = result.model.rmse_mm
+        result.stages_ms.update(pipeline.times.last_ms() | result.stages_ms)
+        self.report.take(result)
+        self.report.seconds = now_s - self._ready_s
+        self.last = result
+        viewer.show(result)
 
     def _write_beside(self, saved: Path, *, picture: bool) -> None:
         """Settings and, where no window showed it, a picture of the last frame."""
@@ -297,13 +276,13 @@ class Session:
         save_settings(settings_file, self.settings, self._uri)
         self.report.written += [saved, settings_file]
         if picture and self.last is not None:
-            step = self.last
+            last = self.last
             row = StillRow(
-                f"{self._uri.rstrip('/').rpartition('/')[2]}, frame {step.frame.index}",
-                step.frame,
-                step.regions,
-                step.improvement,
-                step.acquisition,
+                f"{self._uri.rstrip('/').rpartition('/')[2]}, frame {last.frame.index}",
+                last.frame,
+                last.regions,
+                last.improvement,
+                last.acquisition,
             )
             write_picture(picture_file, contact_sheet([row]))
             self.report.written.append(picture_file)
@@ -330,7 +309,3 @@ def _frames_in_all(limit: int | None, count: int | None) -> int | None:
     """How many frames will come at most; None where nobody knows."""
     known = [number for number in (limit, count) if number is not None]
     return min(known, default=None)
-
-
-def _state(source: DepthSource) -> str:
-    return "replay" if source.frame_count is not None else source.state

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.output import cannot_write, write_picture
-from selective_depth.app.pictures.stills import StillRow, contact_sheet, panels
-from selective_depth.app.pipeline import Loop
-from selective_depth.app.settings import Settings
+from selective_depth.app.console.output import check_picture, is_picture, make_folder
+from selective_depth.app.pictures import StillRow, alone, contact_sheet, panels_of, write_picture
+from selective_depth.app.pipeline import Pipeline
+from selective_depth.app.settings import PictureOptions, Settings
 from selective_depth.drivers.errors import SourceEndedError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
@@ -46,12 +46,14 @@ def still_row(frame: DepthFrame, title: str, settings: Settings) -> StillRow:
     """Run both selectors, and the acquisition where there is a budget, on one frame."""
     # One frame has no frame before it to go on from.
     cold = replace(settings, gas=replace(settings.gas, training="cold"))
-    with Loop(cold) as loop:
-        step = loop.turn(frame)
-    return StillRow(title, frame, step.regions, step.improvement, step.acquisition)
+    with Pipeline(cold) as pipeline:
+        result = pipeline.make(frame)
+    return StillRow(title, frame, result.regions, result.improvement, result.acquisition)
 
 
-def snapshot(sources: Sequence[str], number: int, folder: Path, settings: Settings) -> list[Path]:
+def snapshot(
+    sources: Sequence[str], number: int, out: Path, settings: Settings, page: PictureOptions
+) -> list[Path]:
     """Write a contact sheet with a row per source, and each panel alone.
 
     Parameters
@@ -60,10 +62,12 @@ def snapshot(sources: Sequence[str], number: int, folder: Path, settings: Settin
         As for `open_source`, at least one.
     number : int
         Which frame of each, from 0.
-    folder : Path
-        Where the pictures go; it is made if need be.
+    out : Path
+        A picture, for the sheet alone; or a folder for the sheet and the panels, made if need be.
     settings : Settings
         Options of the seeds, the selectors and the acquisition.
+    page : PictureOptions
+        Size of the sheet, and resolution of both.
 
     Returns
     -------
@@ -79,21 +83,21 @@ def snapshot(sources: Sequence[str], number: int, folder: Path, settings: Settin
     """
     if not sources:
         raise UsageError("no source was named; give recordings, folders or scenes.")
+    single = is_picture(out)
+    if single:
+        check_picture(out)
+    else:
+        make_folder(out)
     names = [short_name(uri) for uri in sources]
     rows = []
     for at, (uri, name) in enumerate(zip(sources, names, strict=True)):
         again = names[:at].count(name)
         title = f"{name}-{again + 1}" if again else name
         rows.append(still_row(nth_frame(uri, number), title, settings))
-    written = [folder / "sheet.png"]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
-    write_picture(written[0], contact_sheet(rows))
-    for row in rows:
-        for panel in panels(row):
-            path = folder / f"{row.title}-{panel.name}.png"
-            write_picture(path, panel.image)
-            written.append(path)
+    written = [out if single else out / "sheet.png"]
+    write_picture(written[0], contact_sheet(rows, page.width), page.dpi)
+    for row in () if single else rows:
+        for panel in panels_of(row):
+            written.append(out / f"{row.title}-{panel.name}.png")
+            write_picture(written[-1], alone(panel), page.dpi)
     return written

@@ -1,9 +1,15 @@
-"""Writing results: refused early where possible, and with one sentence where not."""
+"""Writing results whole or not at all: refused early where possible, else with one sentence."""
 
 from __future__ import annotations
 
 import errno
+import os
+import secrets
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -12,7 +18,8 @@ import numpy.typing as npt
 from selective_depth.app.console.errors import UsageError
 from selective_depth.drivers.errors import OutputError
 
-PICTURES = (".png", ".webp")
+PICTURES = (".png", ".webp", ".pdf", ".svg")
+IMAGES = (".png", ".webp")
 _WEBP_QUALITY = 80
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -40,23 +47,36 @@ def check_output(*paths: Path | None) -> None:
             raise OutputError(f"'{path}' cannot be written: its folder does not exist. Make it.")
 
 
-def check_picture(path: Path | None) -> None:
+def check_picture(path: Path | None, endings: Sequence[str] = PICTURES) -> None:
     """Refuse a picture that cannot be made, before the work is done and not after.
+
+    Parameters
+    ----------
+    path : Path or None
+        The picture, if there is to be one.
+    endings : sequence of str, default .png, .webp, .pdf, .svg
+        What it may end in.
 
     Raises
     ------
     UsageError
-        If its ending names no known kind.
+        If its ending names no known format.
     OutputError
         If its folder does not exist.
     """
-    if path is not None and path.suffix.lower() not in PICTURES:
-        raise UsageError(f"'{path}' is no picture's name: pictures end in .png or .webp.")
+    if path is not None and path.suffix.lower() not in endings:
+        allowed = f"{', '.join(endings[:-1])} or {endings[-1]}"
+        raise UsageError(f"'{path}' is a picture to make; its name must end in {allowed}.")
     check_output(path)
 
 
-def write_output(path: Path, data: bytes | str) -> None:
-    """Write a file.
+def is_picture(path: Path) -> bool:
+    """Whether a file's ending is that of a picture that can be written."""
+    return path.suffix.lower() in PICTURES
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder, and those above it, unless it is there.
 
     Raises
     ------
@@ -64,13 +84,61 @@ def write_output(path: Path, data: bytes | str) -> None:
         If that fails, saying why.
     """
     try:
-        path.write_bytes(data.encode() if isinstance(data, str) else data)
+        path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise cannot_write(path, error) from error
 
 
-def write_picture(path: Path, image: npt.NDArray[np.uint8]) -> None:
-    """Write a blue-green-red picture as PNG or WebP, by the file's ending.
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """Open a file that takes its name, and the older file's place, when it is whole on the disk.
+
+    It is written under another name beside it and renamed at the end, so that a full disk, an
+    error or a killed process leaves the older file as it was. What is no regular file, such as
+    ``/dev/stdout`` or a named pipe, is written directly.
+
+    Raises
+    ------
+    OutputError
+        If that fails, saying why; nothing is left of the new file then.
+    """
+    part: Path | None = None
+    try:
+        if path.parent == Path("/dev") or (path.exists() and not path.is_file()):
+            with path.open("wb") as file:
+                yield file
+            return
+        target = Path(os.path.realpath(path))  # a link stays one
+        part = target.with_name(f".{secrets.token_hex(6)}.part")
+        with part.open("xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        if target.exists():
+            shutil.copymode(target, part)
+        part.replace(target)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    finally:
+        if part is not None:
+            with suppress(OSError):  # renamed, or never made
+                part.unlink()
+
+
+def write_output(path: Path, data: bytes | str) -> None:
+    """Write a file whole or not at all, text as UTF-8.
+
+    Raises
+    ------
+    OutputError
+        If that fails, saying why; an older file of that name stays as it was.
+    """
+    with replacing(path) as file:
+        file.write(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
+
+
+def write_image(path: Path, image: npt.NDArray[np.uint8]) -> None:
+    """Write a blue-green-red image as PNG or WebP, by the file's ending.
 
     Raises
     ------
@@ -79,5 +147,4 @@ def write_picture(path: Path, image: npt.NDArray[np.uint8]) -> None:
     """
     kind = path.suffix.lower()
     options = [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY] if kind == ".webp" else []
-    _, data = cv2.imencode(kind, image, options)
-    write_output(path, data.tobytes())
+    write_output(path, cv2.imencode(kind, image, options)[1].tobytes())

@@ -6,19 +6,14 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from selective_depth.app.console.command import colours
-from selective_depth.app.console.output import (
-    check_output,
-    check_picture,
-    write_output,
-    write_picture,
-)
+from selective_depth.app.console.output import check_output, check_picture, write_output
 from selective_depth.app.console.progress import FrameProgress
 from selective_depth.app.evaluation.evaluate import (
     Outcome,
@@ -28,24 +23,17 @@ from selective_depth.app.evaluation.evaluate import (
     summarise,
 )
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case
-from selective_depth.app.pictures.stills import (
-    ERROR_LIMIT_MM,
-    GAP,
-    PAPER,
-    ROUND_COLOURS,
-    Image,
-    Panel,
-    _backdrop,
-    _coloured,
-    _hatched,
-    finished,
-    write_text,
-)
+from selective_depth.app.pictures import Panel, sheet, write_picture
+from selective_depth.app.pictures.panels import error_panel, shots_panel
+from selective_depth.app.pictures.sheets import WIDTH_IN
 from selective_depth.app.pipeline import say
+from selective_depth.app.settings import PictureOptions
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import acquire, shots_of
-from selective_depth.selectors.quality import errors_of
 from selective_depth.selectors.reconstruct import reconstruct
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SHOWN = ("uniform", "improvement", "gradient", "step", "loop", "oracle")
 TITLES = {
@@ -70,7 +58,8 @@ def run_evaluation(
     jobs: int | None,
     json_file: Path | None,
     picture: Path | None,
-    page: Path | None = None,
+    page: Path | None,
+    format_: PictureOptions,
 ) -> Results:
     """Evaluate, show the table and write what was asked for.
 
@@ -103,12 +92,19 @@ def run_evaluation(
         write_output(page, to_markdown(found))
     if picture is not None:
         frame = next(frames_of(sources, every, 1))
-        sheet = comparison(frame, budgets[0], rounds=rounds, seeds_shape=seeds_shape)
-        write_picture(picture, sheet)
+        shown = comparison(
+            frame, budgets[0], rounds=rounds, seeds_shape=seeds_shape, width_in=format_.width
+        )
+        write_picture(picture, shown, format_.dpi)
     for path in (json_file, page, picture):
         if path is not None:
             say(f"wrote {path}")
     return results
+
+
+def _percent(budget: str) -> str:
+    """A budget such as "0.025" as "2.5%"."""
+    return f"{100 * float(budget):.6g}%"
 
 
 def print_results(results: Results, frames: int, rounds: int) -> None:
@@ -116,7 +112,7 @@ def print_results(results: Results, frames: int, rounds: int) -> None:
     console = Console(highlight=False, no_color=not colours())
     for budget, table in results.items():
         shown = Table(
-            title=f"+{float(budget):.0%} of the pixels · {frames} frames"
+            title=f"+{_percent(budget)} of the pixels · {frames} frames"
             f" · closed loops of {rounds} rounds",
             title_justify="left",
             caption="ratio of the RMSE (mm) to uniform's, geometric mean and worst; share of the"
@@ -149,7 +145,7 @@ def to_markdown(found: Sequence[Outcome]) -> str:
     lines = []
     for budget, table in summarise(found).items():
         lines += [
-            f"| +{float(budget):.0%} | geo | worst | oracle share | least | RMSE mm | MAE mm |",
+            f"| +{_percent(budget)} | geo | worst | oracle share | least | RMSE mm | MAE mm |",
             "|---|---|---|---|---|---|---|",
         ]
         for name, row in table.items():
@@ -162,25 +158,18 @@ def to_markdown(found: Sequence[Outcome]) -> str:
     return "\n".join(lines)
 
 
-def _shots_image(frame: DepthFrame, name: str, case: Case) -> tuple[Image, Image, float, float]:
-    """Where a strategy shot, its error map, its RMSE and MAE."""
-    image = _backdrop(frame)
+def _shown(frame: DepthFrame, name: str, case: Case) -> tuple[Panel, Panel]:
+    """Where a strategy measured, and how wrong the model of it is."""
     if name == "loop":
         acquisition = acquire(frame.measure, case.seeds, rounds=case.rounds, shots=case.shots)
-        uv, order = acquisition.uv, acquisition.round.astype(int)
+        uv, rounds = acquisition.uv, acquisition.round
     else:
         uv = STRATEGIES[name].pixels(case)
         seeds = 0 if name == "uniform" else len(case.seed_uv)
-        order = np.where(np.arange(len(uv)) < seeds, 0, 1)
-    taken = order > 0
-    steps = np.linspace(0, len(ROUND_COLOURS) - 1, max(int(order.max(initial=1)), 1)).astype(int)
-    image[uv[taken, 1], uv[taken, 0]] = ROUND_COLOURS[steps[order[taken] - 1]]
-    model_mm = reconstruct(uv, frame.measure(uv), frame.shape)
-    rmse_mm, mae_mm, _ = errors_of(model_mm, frame.depth_mm)
-    error_mm = np.abs(model_mm - frame.depth_mm.astype(np.float32))
-    # Some errors are a metre, most a millimetre: brightness follows the root.
-    shade = _coloured(np.sqrt(error_mm / ERROR_LIMIT_MM), cv2.COLORMAP_INFERNO)
-    return image, _hatched(shade, frame.depth_mm == 0), rmse_mm, mae_mm
+        rounds = np.where(np.arange(len(uv)) < seeds, 0, 1)
+    shots = shots_panel(frame, uv, rounds, TITLES.get(name, name))
+    error = error_panel(frame, reconstruct(uv, frame.measure(uv), frame.shape), "Model error")
+    return shots, error
 
 
 def comparison(
@@ -190,38 +179,27 @@ def comparison(
     rounds: int = 8,
     seeds_shape: tuple[int, int] = (128, 128),
     strategies: Sequence[str] = SHOWN,
-    width: int = 2000,
-) -> Image:
-    """Where each strategy shot, above the error of its model; blue-green-red picture."""
+    width_in: float = WIDTH_IN,
+) -> Figure:
+    """Where each strategy measured, above the error of its model.
+
+    Parameters
+    ----------
+    frame : DepthFrame
+        What is measured.
+    budget : float
+        Measurements beyond the seeds, as a share of the frame's pixels.
+    rounds : int, default 8
+        Rounds of the closed loops.
+    seeds_shape : tuple of int, default (128, 128)
+        Rows and columns of the seed lattice.
+    strategies : sequence of str
+        Names out of `STRATEGIES`, from left to right.
+    width_in : float, default 16
+        Width of the page in inches.
+    """
     case = Case(frame, seeds_shape, shots_of(float(budget), frame.shape), rounds, 0)
-    each = (width - GAP * (len(strategies) + 1)) // len(strategies)
-    columns = []
-    for name in strategies:
-        shots, error, rmse_mm, mae_mm = _shots_image(frame, name, case)
-        top = finished(Panel(name, TITLES.get(name, name), shots), each)
-        bottom = finished(
-            Panel(
-                "error",
-                f"RMSE {rmse_mm:.1f} mm",
-                error,
-                cv2.COLORMAP_INFERNO,
-                ("0", f"{ERROR_LIMIT_MM:.0f} mm"),
-                f"MAE {mae_mm:.1f} mm",
-            ),
-            each,
-        )
-        columns.append(np.vstack((top, bottom)))
-    sheet = np.full((columns[0].shape[0] + 56, width, 3), PAPER, dtype=np.uint8)
+    shots, errors = zip(*(_shown(frame, name, case) for name in strategies), strict=True)
     total = (len(case.seed_uv) + case.shots) / frame.depth_mm.size
-    write_text(
-        sheet,
-        f"The same {total:.1%} of the pixels: where they were measured, and how wrong the model is",
-        GAP,
-        36,
-        25,
-        weight=700,
-    )
-    for place, column in enumerate(columns):
-        left = GAP + place * (each + GAP)
-        sheet[56:, left : left + each] = column
-    return sheet
+    title = f"The same {total:.1%} of the pixels: where they are measured, and the model's error"
+    return sheet([(title, shots), ("", errors)], width_in, legend=False)

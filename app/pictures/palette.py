@@ -1,15 +1,56 @@
-"""What the colours mean: one place for viewer, legend and their agreement."""
+"""What the colours mean: one table for the viewer, its legend, the pictures and the clouds."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-ERROR_LIMIT_MM = 100.0
-"""Errors and deviations from this on share the brightest colour."""
+Image = npt.NDArray[np.uint8]
+"""Picture, shape (height, width, 3), red-green-blue."""
+Colourmap = Literal["viridis", "inferno", "plasma"]
+"""Called so in Rerun and OpenCV alike."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A quantity that is shown by colours, linearly from dark to bright.
+
+    Parameters
+    ----------
+    quantity : str
+        What it is of.
+    colormap : str
+        Name of the colour map.
+    limits : tuple of float
+        Values at the dark and at the bright end; what lies beyond has the colour of the end.
+    unit : str
+        Of the limits; empty for a pure number.
+    """
+
+    quantity: str
+    colormap: Colourmap
+    limits: tuple[float, float]
+    unit: str = ""
+
+    def colour(self, values: npt.NDArray[np.generic]) -> Image:
+        """Colours of values of any shape, red-green-blue in one axis more; NaN is the dark end."""
+        low, high = self.limits
+        level = np.clip(
+            np.rint((np.nan_to_num(values, nan=low) - low) * (255 / (high - low))), 0, 255
+        )
+        return np.asarray(channels(palette(self.colormap))[level.astype(np.uint8)])
+
+
+IMPROVEMENT = Scale("improvement", "inferno", (0.0, 1.0))
+ERROR = Scale("model error", "inferno", (0.0, 100.0), "mm")
+"""Of the model as of the kriging deviation; larger errors share the brightest colour."""
+DEPTH_COLOURMAP: Colourmap = "viridis"
+ROUND_COLOURMAP: Colourmap = "plasma"
 
 HOLE = 0x6F7480FF
 REGION = 0x26A69AA8
@@ -17,6 +58,8 @@ LONG_EDGE = 0xE6913C6E
 MESH = 0x26A69AFF
 NODE = 0xFFFFFFFF
 """Colours as 0xRRGGBBAA. They differ in lightness too, for colour-blind eyes."""
+UNKNOWN = "no measurement near"
+"""What `HOLE` means."""
 
 BACKGROUND = (13, 13, 13)
 _ROW = 46
@@ -51,7 +94,7 @@ FIGURES = {
     "quantisation_error_mm": ("quantisation error", 0x26A69AFF),
     "rmse_mm": ("model RMSE", 0xE69F00FF),
 }
-"""Running figures of a step: how a plot calls and colours them."""
+"""Running figures of a frame: how a plot calls and colours them."""
 
 STAGE_COLOURS = (
     0x999999FF,
@@ -77,17 +120,47 @@ def depth_limits_mm(depth_mm: npt.NDArray[np.uint16]) -> tuple[int, int]:
     return near, max(int(-(-high // 500)) * 500, near + 500)
 
 
+def depth_scale(limits_mm: tuple[float, float]) -> Scale:
+    """The scale of depth in metres: near is dark, far is bright."""
+    near_mm, far_mm = limits_mm
+    return Scale("depth", DEPTH_COLOURMAP, (near_mm / 1000, far_mm / 1000), "m")
+
+
+def backdrop_limits_mm(limits_mm: tuple[float, float]) -> tuple[float, float]:
+    """Black and white ends of the dim grey frame on which other things are drawn."""
+    near, far = limits_mm
+    return near - 0.3 * (far - near), far + 2.5 * (far - near)
+
+
 @cache
-def palette(colormap: int, count: int = 256) -> npt.NDArray[np.uint32]:
-    """Colours of an OpenCV colour map, packed as 0xRRGGBBAA."""
-    levels = np.linspace(0, 255, count).astype(np.uint8).reshape(-1, 1)
-    bgr = np.asarray(cv2.applyColorMap(levels, colormap))[:, 0].astype(np.uint32)
+def palette(colormap: Colourmap) -> npt.NDArray[np.uint32]:
+    """The 256 colours of a colour map, packed as 0xRRGGBBAA."""
+    number = getattr(cv2, f"COLORMAP_{colormap.upper()}")
+    levels = np.arange(256, dtype=np.uint8).reshape(-1, 1)
+    bgr = np.asarray(cv2.applyColorMap(levels, number))[:, 0].astype(np.uint32)
     packed = bgr @ np.array([1 << 8, 1 << 16, 1 << 24], dtype=np.uint32) + np.uint32(255)
     return np.asarray(packed, dtype=np.uint32)
 
 
-def picture(limits_mm: tuple[float, float], rounds: int) -> npt.NDArray[np.uint8]:
+@cache
+def round_colours(rounds: int) -> npt.NDArray[np.uint32]:
+    """One colour per round, dark to bright; round 0, the seeds, is grey."""
+    levels = np.linspace(70, 240, rounds) if rounds > 1 else np.array([170])
+    ramp = palette(ROUND_COLOURMAP)[levels.astype(int)]
+    return np.concatenate((np.array([HOLE], dtype=np.uint32), ramp))
+
+
+def channels(packed: npt.NDArray[np.uint32] | int) -> Image:
+    """Packed colours of shape (...) as red, green, blue of shape (..., 3)."""
+    shift = np.array([24, 16, 8], dtype=np.uint32)
+    return (np.asarray(packed, np.uint32)[..., None] >> shift).astype(np.uint8)
+
+
+def picture(limits_mm: tuple[float, float], rounds: int) -> Image:
     """Draw the legend of the viewer: every colour scale with its ends, every single colour.
+
+    OpenCV draws it: the first frame waits for it, and matplotlib alone takes half a second to
+    import.
 
     Parameters
     ----------
@@ -102,47 +175,34 @@ def picture(limits_mm: tuple[float, float], rounds: int) -> npt.NDArray[np.uint8
         Red-green-blue, on the viewer's own background.
     """
     near, far = (f"{limit / 1000:.1f} m" for limit in limits_mm)
-    scales = [("depth", cv2.COLORMAP_VIRIDIS, near, far)]
-    scales.append(("improvement", cv2.COLORMAP_INFERNO, "none", "most"))
+    ramps = [("depth", palette(DEPTH_COLOURMAP), near, far)]
+    ramps.append((IMPROVEMENT.quantity, palette(IMPROVEMENT.colormap), "none", "most"))
     if rounds:
         last = f"round {rounds}" if rounds > 1 else ""
-        scales.append(("acquired in", cv2.COLORMAP_PLASMA, "round 1", last))
-        limit = f"{ERROR_LIMIT_MM:.0f} mm"
-        scales.append(("model error", cv2.COLORMAP_INFERNO, "0", limit))
+        ramps.append(("acquired in", round_colours(rounds)[1:], "round 1", last))
+        limit = f"{ERROR.limits[1]:.0f} {ERROR.unit}"
+        ramps.append((ERROR.quantity, palette(ERROR.colormap), "0", limit))
     swatches = [
-        ("no measurement, or too far from one", HOLE),
+        (UNKNOWN, HOLE),
         ("kept triangles: the regions selected", REGION | 0xFF),
         ("neural-gas nodes", NODE),
     ]
-    image = np.full((_ROW * (len(scales) + len(swatches)) + 20, 760, 3), BACKGROUND, np.uint8)
-    for row, (name, colormap, low, high) in enumerate(scales):
+    image = np.full((_ROW * (len(ramps) + len(swatches)) + 20, 760, 3), BACKGROUND, np.uint8)
+    for row, (name, ramp, low, high) in enumerate(ramps):
         base = _ROW * row + 44
-        ramp = round_colours(rounds)[1:] if name == "acquired in" else palette(colormap)
         _write(image, name, 20, base)
         end = _write(image, low, 220, base)
-        colours = _channels(ramp[np.arange(240) * len(ramp) // 240])
+        colours = channels(ramp[np.arange(240) * len(ramp) // 240])
         image[base - 22 : base + 4, max(end, 320) + 16 : max(end, 320) + 256] = colours
         _write(image, high, max(end, 320) + 272, base)
     for row, (name, colour) in enumerate(swatches):
-        base = _ROW * (len(scales) + row) + 44
-        image[base - 22 : base + 4, 20:64] = _channels(np.array([colour], dtype=np.uint32))
+        base = _ROW * (len(ramps) + row) + 44
+        image[base - 22 : base + 4, 20:64] = channels(colour)
         _write(image, name, 84, base)
     return image
 
 
-def _channels(packed: npt.NDArray[np.uint32]) -> npt.NDArray[np.uint8]:
-    """Packed colours of shape (n,) as red, green, blue of shape (n, 3)."""
-    return (packed[:, None] >> np.array([24, 16, 8], dtype=np.uint32)).astype(np.uint8)
-
-
-def _write(image: npt.NDArray[np.uint8], text: str, left: int, base: int) -> int:
+def _write(image: Image, text: str, left: int, base: int) -> int:
     face = cv2.FontFace("sans")
     (end, _), _ = cv2.putText(image, text, (left, base), (225, 225, 225), face, 28, 400)
     return int(end)
-
-
-@cache
-def round_colours(rounds: int) -> npt.NDArray[np.uint32]:
-    """One colour per round, dark to bright; round 0, the seeds, is grey."""
-    ramp = palette(cv2.COLORMAP_PLASMA)[np.linspace(70, 240, max(rounds, 1)).astype(int)]
-    return np.concatenate((np.array([HOLE], dtype=np.uint32), ramp))

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from selective_depth.app.console.output import write_output
-from selective_depth.app.pipeline.result import Step
+from selective_depth.app.pipeline.result import FrameResult
 from selective_depth.app.pipeline.timing import StageSummary
 from selective_depth.app.settings import Settings, to_toml
 
@@ -40,7 +40,7 @@ class Mean:
 
 @dataclass
 class RunReport:
-    """Figures of a run, gathered step by step.
+    """Figures of a run, gathered frame by frame.
 
     Parameters
     ----------
@@ -76,20 +76,13 @@ class RunReport:
         """Frames per second of the whole loop: waiting, reading and handing over included."""
         return self.frames / self.seconds if self.seconds else 0.0
 
-    def take(self, step: Step) -> None:
-        """Add a step."""
+    def take(self, result: FrameResult) -> None:
+        """Add a frame's result."""
         self.frames += 1
-        self.samples.add(count_samples(step))
-        self.quantisation_error_mm.add(step.regions.quantisation_error_mm)
-        if step.model is not None:
-            self.rmse_mm.add(step.model.rmse_mm)
-
-
-def count_samples(step: Step) -> int:
-    """Measurements of a step that returned depth, seeds included."""
-    if step.acquisition is None:
-        return int(step.seeds.valid.sum())
-    return int(step.acquisition.returned.sum())
+        self.samples.add(result.samples)
+        self.quantisation_error_mm.add(result.regions.quantisation_error_mm)
+        if result.model is not None:
+            self.rmse_mm.add(result.model.rmse_mm)
 
 
 def say(sentence: str) -> None:

@@ -1,10 +1,8 @@
-"""What one turn of the loop found: the record that viewer and reports are fed with."""
+"""The one result of a frame: what pipeline, viewer, stills and reports pass on."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,16 +12,6 @@ from selective_depth.selectors.acquire import Acquisition
 from selective_depth.selectors.improvement import ImprovementSelection
 from selective_depth.selectors.neural_gas import RegionSelection
 from selective_depth.selectors.seeds import SeedGrid
-
-
-class Arrival(NamedTuple):
-    """A frame as it came from its source."""
-
-    frame: DepthFrame
-    state: str = "replay"
-    """The sensor's, as in `Step`."""
-    read_ms: float = math.nan
-    """How long it was waited for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +34,7 @@ class Model:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class FrameResult:
     """One frame and all that was made of it.
 
     Parameters
@@ -70,7 +58,13 @@ class Step:
         Duration of each stage in milliseconds: this frame's own, but for `log`, and for `model`
         where frames do not wait; those are the latest.
     figures : dict of str to float
-        Running figures by name, those of `legend.FIGURES`.
+        Running figures by name, those of the palette's `FIGURES`; a run adds its rate and its
+        drops before it hands the result on.
+
+    Attributes
+    ----------
+    samples : int
+        Measurements that returned depth, seeds included.
     """
 
     frame: DepthFrame
@@ -83,9 +77,16 @@ class Step:
     stages_ms: dict[str, float] = field(default_factory=dict)
     figures: dict[str, float] = field(default_factory=dict)
 
+    @property
+    def samples(self) -> int:
+        """Measurements that returned depth, seeds included."""
+        if self.acquisition is None:
+            return int(self.seeds.valid.sum())
+        return int(self.acquisition.returned.sum())
+
 
 @dataclass(frozen=True, slots=True)
-class StateNote:
+class SensorNote:
     """The sensor's state, told while there is no frame to tell it with."""
 
     state: str

@@ -25,7 +25,7 @@ from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError, ViewerError
 from selective_depth.app.console.output import cannot_write
 from selective_depth.app.pictures import palette as legend
-from selective_depth.app.pipeline import STAGES, StateNote, Step
+from selective_depth.app.pipeline import STAGES, FrameResult, SensorNote
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.frame import Camera, DepthFrame
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 APPLICATION = "selective-depth"
 _MAGIC = b"RRF2"
-DEPTH_COLOURS = legend.palette(cv2.COLORMAP_VIRIDIS)
+DEPTH_COLOURS = legend.palette(legend.DEPTH_COLOURMAP)
 LOAD_S = 5.0
 """How long a viewer may show nothing while it is loading nothing."""
 PAINT_S = 30.0
@@ -70,7 +70,7 @@ class StepLogger:
         self._state = ""
         self._limits_mm = (0.0, 1.0)
 
-    def log(self, step: Step) -> None:
+    def log(self, step: FrameResult) -> None:
         """Log a step under its frame's number and time."""
         if self._start_us is None:
             self._start_us = step.frame.timestamp_us
@@ -109,7 +109,7 @@ class StepLogger:
             self._state = state
             self._stream.log("sensor/state", rr.StateChange(state=state))
 
-    def _log_static(self, step: Step) -> None:
+    def _log_static(self, step: FrameResult) -> None:
         camera, log, options = step.frame.camera, self._stream.log, self._options
         near, far = legend.depth_limits_mm(step.frame.depth_mm)
         near = near if options.near_mm is None else options.near_mm
@@ -155,13 +155,13 @@ class StepLogger:
     def _log_classes(self) -> None:
         log = self._stream.log
         nothing = (0, "", (0, 0, 0, 0))
-        hole = (1, "no measurement, or too far from one", legend.HOLE)
+        hole = (1, legend.UNKNOWN, legend.HOLE)
         kept, long = (1, "kept triangles", legend.REGION), (2, "long edges", legend.LONG_EDGE)
         # A class means what the nearest context above says: one for all, one for the regions.
         log("camera", rr.AnnotationContext([nothing, hole]), static=True)
         log("camera/gas", rr.AnnotationContext([nothing, kept, long]), static=True)
 
-    def _log_sensor(self, step: Step) -> None:
+    def _log_sensor(self, step: FrameResult) -> None:
         log, depth_mm, seeds = self._stream.log, step.frame.depth_mm, step.seeds
         log("camera/depth", self._depth_image(depth_mm))
         log("camera/holes", rr.SegmentationImage((depth_mm == 0).view(np.uint8), opacity=1.0))
@@ -191,10 +191,10 @@ class StepLogger:
         )
         log("world/regions", mesh)
 
-    def _log_improvement(self, step: Step) -> None:
+    def _log_improvement(self, step: FrameResult) -> None:
         log, improvement = self._stream.log, step.improvement
         known = improvement.known
-        log("camera/improvement/score", _map_image(improvement.score, 1.0, known))
+        log("camera/improvement/score", _map_image(improvement.score, legend.IMPROVEMENT, known))
         log(
             "camera/improvement/unknown", rr.SegmentationImage((~known).view(np.uint8), opacity=1.0)
         )
@@ -203,10 +203,10 @@ class StepLogger:
                 "camera/improvement/estimate", self._depth_image(_as_depth(improvement.estimate_mm))
             )
             deviation_mm = np.sqrt(np.where(known, improvement.variance_mm2, 0))
-            image = _map_image(deviation_mm, legend.ERROR_LIMIT_MM, known)
+            image = _map_image(deviation_mm, legend.ERROR, known)
             log("camera/improvement/deviation", image)
 
-    def _log_acquisition(self, step: Step) -> None:
+    def _log_acquisition(self, step: FrameResult) -> None:
         log, acquisition = self._stream.log, step.acquisition
         if acquisition is None:
             return
@@ -223,18 +223,21 @@ class StepLogger:
             log("camera/model", self._depth_image(_as_depth(step.model.depth_mm)))
             error_mm = step.model.error_mm
             known = ~np.isnan(error_mm)
-            log("camera/error", _map_image(error_mm, legend.ERROR_LIMIT_MM, known))
+            log("camera/error", _map_image(error_mm, legend.ERROR, known))
 
-    def _log_figures(self, step: Step) -> None:
+    def _log_figures(self, step: FrameResult) -> None:
         log = self._stream.log
-        log("figures/stages", rr.Scalars(list(step.stages_ms.values())))
+        log("figures/stages", rr.Scalars([step.stages_ms.get(name, np.nan) for name in STAGES]))
         for name, value in step.figures.items():
             if np.isfinite(value):
                 log(f"figures/{name}", rr.Scalars(value))
 
     def _depth_image(self, depth_mm: npt.NDArray[np.uint16]) -> rr.DepthImage:
         return rr.DepthImage(
-            depth_mm, meter=1000.0, colormap="viridis", depth_range=list(self._limits_mm)
+            depth_mm,
+            meter=1000.0,
+            colormap=legend.DEPTH_COLOURMAP,
+            depth_range=list(self._limits_mm),
         )
 
 
@@ -249,13 +252,13 @@ def _as_depth(value_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
 
 
 def _map_image(
-    value: npt.NDArray[np.float32], limit: float, known: npt.NDArray[np.bool_]
+    value: npt.NDArray[np.float32], scale: legend.Scale, known: npt.NDArray[np.bool_]
 ) -> rr.DepthImage:
-    """Values of 0..limit as a coloured 8-bit image: 1..255, and 0 where nothing is known."""
+    """Values on a scale from 0 as a coloured 8-bit image: 1..255, and 0 where nothing is known."""
     # Saturates in one pass; what it makes of a NaN does not matter, that is nowhere known.
-    levels = np.asarray(cv2.convertScaleAbs(value, alpha=254 / limit, beta=1))
+    levels = np.asarray(cv2.convertScaleAbs(value, alpha=254 / scale.limits[1], beta=1))
     np.multiply(levels, known, out=levels)
-    return rr.DepthImage(levels, colormap="inferno", depth_range=[1.0, 255.0])
+    return rr.DepthImage(levels, colormap=scale.colormap, depth_range=[1.0, 255.0])
 
 
 def _closed_strips(points_uv: npt.NDArray[np.float32]) -> pa.Array:
@@ -293,8 +296,7 @@ def blueprint(
         Ends of the depth scale.
     """
 
-    near, far = limits_mm
-    dim_range = [near - 0.3 * (far - near), far + 1.5 * (far - near)]
+    dim_range = list(legend.backdrop_limits_mm(limits_mm))
 
     def image(name: str, *entities: str, backdrop: bool = False) -> rrb.Spatial2DView:
         contents = [f"/camera/{entity}" for entity in entities]
@@ -375,9 +377,8 @@ def blueprint(
 
 def epoch_blueprint(limits_mm: tuple[float, float]) -> rrb.Blueprint:
     """Layout for trainings of several lengths: nodes, kept triangles and long edges, in space."""
-    near, far = limits_mm
     grey = rr.DepthImage.from_fields(
-        colormap="grayscale", depth_range=[near - 0.3 * (far - near), far + 1.5 * (far - near)]
+        colormap="grayscale", depth_range=list(legend.backdrop_limits_mm(limits_mm))
     )
 
     def image(name: str, *entities: str) -> rrb.Spatial2DView:
@@ -487,9 +488,9 @@ class Recording:
         sink = rr.GrpcServerSink(host, port, server_memory_limit=options.serve_memory)
         return cls(sink, options)
 
-    def log(self, item: Step | StateNote) -> None:
+    def log(self, item: FrameResult | SensorNote) -> None:
         """Log a step, or the sensor's state."""
-        if isinstance(item, StateNote):
+        if isinstance(item, SensorNote):
             self._logger.log_state(item.state)
         else:
             self._logger.log(item)

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from selective_depth.app.console.errors import ViewerError
 from selective_depth.app.console.output import cannot_write
-from selective_depth.app.pipeline import StageTimes, StateNote, Step
+from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.handover import Handover
 from selective_depth.app.viewer.recording import WRITE_S, Recording, never_wait_at_exit, open_window
@@ -71,10 +71,10 @@ class Place(ABC):
         """Open the recording, in the thread that will feed it."""
         self._recording = self._connect()
 
-    def put(self, item: Step | StateNote) -> None:
+    def put(self, item: FrameResult | SensorNote) -> None:
         """Log a step, or the sensor's state."""
         assert self._recording is not None
-        if isinstance(item, StateNote):
+        if isinstance(item, SensorNote):
             self._recording.log(item)
             return
         with self._times.stage("log"):
@@ -123,7 +123,7 @@ class FilePlace(Place):
                 f" {SPARE_BYTES >> 20} MiB of a disk alone. Make room, or name a file elsewhere."
             )
 
-    def put(self, item: Step | StateNote) -> None:
+    def put(self, item: FrameResult | SensorNote) -> None:
         """Log a step, if the disk has room for it."""
         free = shutil.disk_usage(self.path.parent).free
         if free < SPARE_BYTES:
@@ -205,14 +205,14 @@ class RemotePlace(Place):
                 f"no viewer listens at {url}. Start one there with 'rerun', or leave out --connect."
             )
 
-    def put(self, item: Step | StateNote) -> None:
+    def put(self, item: FrameResult | SensorNote) -> None:
         """Log a step and see it off, however long the viewer takes."""
         if self._recording is None and time.monotonic() - self._checked_s > CHECK_EVERY_S:
             self._checked_s = time.monotonic()
             if listens(self._address):
                 self.open()  # it is back
         if self._recording is None:
-            self.missed += isinstance(item, Step)
+            self.missed += isinstance(item, FrameResult)
             return
         super().put(item)
         if not self._recording.flush():
@@ -325,7 +325,7 @@ class Viewer:
             self._places.insert(0, FilePlace(options.save, options, times, index=index))
         if self.window:
             self._places.append(WindowPlace(options, times))
-        self._ways: list[Handover[Step | StateNote]] = []
+        self._ways: list[Handover[FrameResult | SensorNote]] = []
         for place in self._places:
             file = isinstance(place, FilePlace)
             self._ways.append(
@@ -349,7 +349,7 @@ class Viewer:
         for way in self._ways:
             way.ready.wait(READY_S)
 
-    def show(self, item: Step | StateNote) -> None:
+    def show(self, item: FrameResult | SensorNote) -> None:
         """Hand a step, or the sensor's state without one, to every place.
 
         Raises

@@ -158,9 +158,8 @@ def acquire(
     Raises
     ------
     ValueError
-        If an argument is out of its range, the sensor answers with anything but one depth per
-        pixel, or with metres beside seeds in millimetres, or a selector's plan asks for a pixel
-        twice or for more than is left.
+        If an argument is out of its range, the sensor does not answer with one depth per pixel, in
+        millimetres as the seeds, or a selector's plan asks for a pixel twice or for too many.
     TypeError
         If `selector` is none.
     """

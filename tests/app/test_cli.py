@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import os
 import random
 import re
@@ -301,19 +300,6 @@ def test_unwritable_output(place: str, capsys: pytest.CaptureFixture[str], tmp_p
     (tmp_path / "folder.rrd").mkdir()
     _, line = refuse(capsys, "replay", ENDLESS, *QUICK, "--save", str(tmp_path / place))
     assert "cannot be written" in line
-
-
-def test_a_full_disk_is_said_to_be_full(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(path: Path, data: bytes) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    source = "virtual:ball?size=64x48&frames=1"
-    small = ["--seeds.rows", "16", "--seeds.columns", "16"]
-    _, line = refuse(capsys, "model", source, str(tmp_path), *small)
-    assert "cloud.ply' cannot be written: No space left on device. Make room there" in line
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,9 @@ from selective_depth.app.commands.model import save_cloud, save_depth, save_mode
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.evaluation import evaluate as protocol
 from selective_depth.app.evaluation.evaluate import Errors, Outcome, outcomes, summarise
-from selective_depth.app.evaluation.report import comparison, to_markdown
+from selective_depth.app.evaluation.report import comparison, print_results, to_markdown
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case
+from selective_depth.app.pictures import palette
 from selective_depth.drivers.errors import OutputError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.source import DepthSource
@@ -325,18 +326,35 @@ def test_the_command_writes_table_file_and_picture(
     assert document["0.05"]["oracle"]["share"] == pytest.approx(1)
     assert "(`loop`) |" in (tmp_path / "page.md").read_text()
     image = cv2.imread(str(picture))
-    assert image is not None and image.shape[1] == 2000
+    assert image is not None and image.shape[1] == 1600
     assert run(["evaluate", str(folder), "--budget", "2"]) == MISUSED
     assert run(["evaluate", str(folder), "--picture", "out.gif"]) == MISUSED
     assert run(["evaluate", str(folder), "--json", str(tmp_path / "no" / "out.json")]) == FAILED
 
 
-def test_the_picture_shows_shots_and_errors() -> None:
-    sheet = comparison(
-        frame(), 0.05, rounds=2, seeds_shape=SHAPE, strategies=("uniform", "loop"), width=800
+def test_the_picture_shows_shots_and_errors(tmp_path: Path) -> None:
+    shown = comparison(frame(), 0.05, rounds=2, seeds_shape=SHAPE, strategies=("uniform", "loop"))
+    images = [axes.images[0].get_array() for axes in shown.axes]
+    assert len(images) == 4
+    for image, rounds in zip(images[:2], (1, 2), strict=True):
+        seen = {tuple(pixel) for pixel in image.reshape(-1, 3).tolist()}
+        colours = palette.channels(palette.round_colours(rounds)[1:])
+        assert all(tuple(colour) in seen for colour in colours.tolist())
+    brightness = [image.astype(int).sum() for image in images[2:]]
+    assert brightness[1] < brightness[0]  # the loop errs less
+
+
+@pytest.mark.parametrize(
+    ("budget", "said"), [("0.005", "+0.5%"), ("0.025", "+2.5%"), ("0.05", "+5%"), ("0.10", "+10%")]
+)
+def test_a_budget_is_said_as_it_was_asked_for(
+    budget: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figures = dict.fromkeys(
+        ("geo", "worst", "share", "share_min", "rmse_mm", "mae_mm", "wrong", "missed"), 0.5
     )
-    assert sheet.dtype == np.uint8 and sheet.shape[1] == 800
-    assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 50
+    print_results({budget: {"loop": figures}}, frames=3, rounds=2)
+    assert f"{said} of the pixels" in capsys.readouterr().out
 
 
 def test_the_model_as_files(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from rerun.chunk import RrdReader
 
 from selective_depth.app import cli
 from selective_depth.app.commands import figures
+from selective_depth.app.pictures import palette, write_picture
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.selectors.seeds import SeedGrid
 
@@ -48,18 +49,20 @@ def test_each_length_is_a_training_of_its_own():
     assert np.array_equal(trained[4]["3d"].nodes_mm, trained[4]["image"].nodes_mm)
 
 
-def test_figure_has_a_column_per_training_and_shows_its_nodes_and_regions():
+def test_figure_has_a_column_per_training_and_shows_its_nodes_and_regions(tmp_path: Path):
     frame = ball()
     seeds = SeedGrid.from_frame(frame, (40, 40))
     trained = list(figures.epoch_selections(seeds, (1, 3, 5), nodes=80))
-    picture = figures.epochs_figure(frame, seeds, trained)
-    columns = np.array_split(picture[60:], 4, axis=1)
-    red = [((part[..., 2] > 180) & (part[..., 0] < 110)).sum() for part in columns]
-    dark = [(part.max(axis=2) < 110).sum() for part in columns]
-    assert min(red[1:]) > 10 * max(red[0], 20)
-    for count, (_, chosen) in zip(dark[1:], trained, strict=True):
-        if chosen["3d"].mask.any():
-            assert count > 200
+    write_picture(tmp_path / "a.png", figures.epochs_figure(frame, seeds, trained))
+    picture = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png")), cv2.COLOR_BGR2RGB).astype(int)
+    rows = np.array_split(picture, 3)
+    teal = palette.channels(palette.REGION).astype(int)
+    kept = (np.abs(np.array_split(rows[1], 4, axis=1)[3] - teal).max(axis=2) < 60).sum()
+    assert not trained[2][1]["3d"].mask.any() or kept > 2000
+    dark = [(part.max(axis=2) < 90).sum() for part in np.array_split(rows[0], 4, axis=1)]
+    assert min(dark[1:]) > 10 * dark[0]  # the object is light, what nodes are drawn on is dark
+    empty = np.array_split(rows[2], 4, axis=1)[0]
+    assert (empty[80:] == 255).all()  # under the object
 
 
 def test_table_has_a_row_per_training_with_shares_that_add_up():
@@ -125,11 +128,12 @@ def test_table_is_written(small, tmp_path: Path, capsys):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["epochs", OBJECT, "--out", "x.gif"], "pictures end in .png or .webp"),
+        (["epochs", OBJECT, "--out", "x.gif"], "must end in .png, .webp, .pdf or .svg"),
         (["epochs", OBJECT, "--out", "no/such/x.png"], "its folder does not exist"),
         (["epochs", OBJECT, "--frame", "9"], "the last is"),
         (["nodes", OBJECT, "--every", "0"], "--every is 0; it must be 1 or more"),
         (["nodes", OBJECT, "--out", "no/such/x.md"], "its folder does not exist"),
+        (["nodes", "virtual:ball?live=1", "--every", "2"], "never ends"),
         (["epochs", "nowhere.ply"], "nowhere.ply"),
     ],
 )
@@ -148,6 +152,7 @@ def test_epochs_that_cannot_be_written_are_an_error_and_leave_nothing(tmp_path: 
 import resource, signal
 from selective_depth.app import cli
 from selective_depth.app.commands import figures
+from selective_depth.app.pictures import palette, write_picture
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 figures.EPOCHS, figures.FIRST_POINTS, figures.FIRST_NODES = (1, 2), 500, 100

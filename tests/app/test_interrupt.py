@@ -13,7 +13,7 @@ import pytest
 
 from selective_depth.app import cli
 from selective_depth.app.console import interrupt
-from selective_depth.app.pipeline import Loop
+from selective_depth.app.pipeline import Pipeline
 
 
 def fail(*_: object) -> None:
@@ -40,7 +40,7 @@ def test_a_run_interrupted_in_a_compiled_function_ends_as_any_other(
         fail()
 
     monkeypatch.setattr(interrupt, "_asked", asked)
-    monkeypatch.setattr(Loop, "_regions", interrupted)
+    monkeypatch.setattr(Pipeline, "_regions", interrupted)
     arguments = ["replay", "virtual:ball?size=64x48&frames=9", "--headless"]
     assert cli.run([*arguments, "--seeds.rows", "16", "--seeds.columns", "16"]) == 130
     shown = capsys.readouterr()

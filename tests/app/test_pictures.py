@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,13 +11,15 @@ import pytest
 
 from selective_depth.app.commands.snapshot import short_name, snapshot, still_row
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.pictures import stills
-from selective_depth.app.settings import AcquireOptions, GasOptions, Settings
+from selective_depth.app.pictures import StillRow, contact_sheet, palette, write_picture
+from selective_depth.app.pictures import panels as parts
+from selective_depth.app.settings import AcquireOptions, GasOptions, PictureOptions, Settings
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.folder import write_folder
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.open import open_source
 
+PAGE = PictureOptions()
 SMALL = Settings(gas=GasOptions(nodes=300), acquire=AcquireOptions(budget=0.02, rounds=2))
 
 
@@ -29,85 +32,117 @@ def step_frame() -> DepthFrame:
 
 
 @pytest.fixture(scope="module")
-def row() -> stills.StillRow:
+def row() -> StillRow:
     return still_row(step_frame(), "box", SMALL)
 
 
-def test_every_panel_has_the_size_of_the_frame(row: stills.StillRow) -> None:
-    made = stills.panels(row)
-    assert [panel.name for panel in made] == [
-        "depth",
-        "neural-gas",
-        "improvement",
-        "acquired",
-        "error",
-    ]
+def hexadecimal(colour: int) -> tuple[int, ...]:
+    return tuple(palette.channels(colour).tolist())
+
+
+def test_every_panel_has_the_size_of_the_frame(row: StillRow) -> None:
+    made = parts.panels_of(row)
+    names = ["depth", "neural-gas", "improvement", "acquired", "error"]
+    assert [panel.name for panel in made] == names
     for panel in made:
         assert panel.image.shape == (240, 320, 3)
         assert panel.image.dtype == np.uint8
 
 
-def test_holes_have_a_colour_that_no_depth_has(row: stills.StillRow) -> None:
-    image = stills.depth_panel(row.frame).image
-    hole = image[30:50, 30:50].reshape(-1, 3)
-    assert {tuple(c) for c in hole} == {tuple(stills.HOLE), tuple(stills.HATCH)}
-    measured = image[row.frame.depth_mm > 0]
-    assert not (measured == stills.HOLE).all(axis=1).any()
+def test_holes_have_a_colour_that_no_depth_and_no_score_has(row: StillRow) -> None:
+    hole = np.array(hexadecimal(palette.HOLE))
+    image = parts.depth_panel(row.frame).image
+    assert (image[30:50, 30:50] == hole).all()
+    assert not (image[row.frame.depth_mm > 0] == hole).all(axis=1).any()
+    for name in (palette.DEPTH_COLOURMAP, palette.ERROR.colormap, palette.ROUND_COLOURMAP):
+        away = np.abs(palette.channels(palette.palette(name)).astype(int) - hole).max(axis=1)
+        assert away.min() > 25, name
 
 
-def test_near_is_brighter_than_far(row: stills.StillRow) -> None:
-    grey = cv2.cvtColor(stills.depth_panel(row.frame).image, cv2.COLOR_BGR2GRAY)
-    assert grey[120, 160] > grey[200, 300] + 40
+def test_near_is_darker_than_far_as_in_the_viewer(row: StillRow) -> None:
+    grey = cv2.cvtColor(parts.depth_panel(row.frame).image, cv2.COLOR_RGB2GRAY)
+    assert grey[120, 160] < grey[200, 300] - 40
 
 
-def test_the_map_is_brightest_along_the_step(row: stills.StillRow) -> None:
-    image = stills.improvement_panel(row.improvement).image.astype(int).sum(axis=2)
+def test_a_scale_is_linear_between_its_limits_and_dark_where_nothing_is_known() -> None:
+    colours = palette.channels(palette.palette(palette.ERROR.colormap))
+    shown = palette.ERROR.colour(np.array([-5.0, 0.0, 50.0, 100.0, 1e9, np.nan]))
+    np.testing.assert_array_equal(shown, colours[[0, 0, 128, 255, 255, 0]])
+
+
+def test_the_map_is_brightest_along_the_step(row: StillRow) -> None:
+    image = parts.improvement_panel(row.improvement).image.astype(int).sum(axis=2)
     assert image[120, 114:126].max() > image[120, 150:170].max() + 100
 
 
-def test_shots_are_drawn_where_they_were_made(row: stills.StillRow) -> None:
+def test_shots_are_drawn_where_they_were_made(row: StillRow) -> None:
     assert row.acquisition is not None
-    image = stills.samples_panel(row.frame, row.acquisition).image
-    colours = {tuple(c) for c in stills.ROUND_COLOURS}
+    image = parts.samples_panel(row.frame, row.acquisition).image
+    colours = {hexadecimal(int(colour)) for colour in palette.round_colours(2)[1:]}
     shot = row.acquisition.mask()
-    assert all(tuple(c) in colours for c in image[shot])
-    assert not any(tuple(c) in colours for c in image[~shot][::50])
+    assert {tuple(c) for c in image[shot].tolist()} == colours
+    assert not any(tuple(c) in colours for c in image[~shot][::50].tolist())
 
 
 def test_depth_limits_are_whole_half_metres() -> None:
     depth = np.linspace(1230, 3340, 10_000).astype(np.uint16)
-    assert stills.depth_limits_mm(depth) == (1000, 3500)
-    assert stills.depth_limits_mm(np.zeros(4, np.uint16)) == (500, 5000)
-    low, high = stills.depth_limits_mm(np.full(9, 2000, np.uint16))
+    assert palette.depth_limits_mm(depth) == (1000, 3500)
+    assert palette.depth_limits_mm(np.zeros(4, np.uint16)) == (500, 5000)
+    low, high = palette.depth_limits_mm(np.full(9, 2000, np.uint16))
     assert low < high
 
 
-def test_a_frame_without_depth_can_be_drawn() -> None:
+def test_a_frame_without_depth_can_be_drawn(tmp_path: Path) -> None:
     blank = DepthFrame(np.zeros((240, 320), np.uint16), 0, 0, Camera.kinect(320, 240))
-    sheet = stills.contact_sheet([still_row(blank, "nothing", SMALL)])
-    assert sheet.shape[1] == stills.SHEET_WIDTH
+    write_picture(tmp_path / "a.png", contact_sheet([still_row(blank, "nothing", SMALL)]))
+    sheet = cv2.imread(str(tmp_path / "a.png"))
+    assert sheet is not None and sheet.shape[1] == 1600
 
 
-def test_no_text_leaves_its_panel(row: stills.StillRow) -> None:
-    """The caption and the scale fit for three panels a row as for five."""
-    for panel in stills.panels(row):
-        for width in (300, 520):
-            assert stills.text_width(panel.caption, 19 if width >= 420 else 16, 600) < width
-            assert stills.finished(panel, width).shape[1] == width
+@pytest.mark.parametrize("columns", [3, 5])
+def test_no_text_leaves_the_page_or_runs_into_another(columns: int, row: StillRow) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.text import Text
+
+    sheet = contact_sheet([row if columns == 5 else replace(row, acquisition=None)])
+    canvas = FigureCanvasAgg(sheet)
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    texts = [text for text in sheet.findobj(Text) if text.get_text() and text.get_visible()]
+    texts = [text for text in texts if text.axes is None or text in text.axes.texts]
+    boxes = [text.get_window_extent(renderer) for text in texts]
+    assert len(boxes) > 2 * columns
+    for at, box in enumerate(boxes):
+        assert box.x0 >= 0 and box.y0 >= 0, texts[at]
+        assert box.x1 <= sheet.bbox.x1 and box.y1 <= sheet.bbox.y1, texts[at]
+        for other in range(at):
+            assert not box.overlaps(boxes[other]), (texts[at], texts[other])
+
+
+def test_the_ending_is_the_format_and_size_and_resolution_are_as_asked(
+    row: StillRow, tmp_path: Path
+) -> None:
+    begins = {"pdf": b"%PDF", "svg": b"<?xml", "webp": b"RIFF", "png": b"\x89PNG"}
+    for ending, begin in begins.items():
+        path = tmp_path / f"a.{ending}"
+        write_picture(path, contact_sheet([row], 8.0), 150)
+        assert path.read_bytes().startswith(begin)
+    sheet = cv2.imread(str(tmp_path / "a.png"))
+    assert sheet is not None and sheet.shape[1] == 8 * 150
 
 
 def test_snapshots_of_one_name_and_of_strange_names_are_all_written(tmp_path: Path) -> None:
     frames = tmp_path / "frames\udcff"  # a name that is no UTF-8
     with open_source("virtual:ball?size=320x240&frames=1") as source:
         write_folder(frames, source)
-    written = snapshot([str(frames), str(frames)], 0, tmp_path / "out", SMALL)
+    written = snapshot([str(frames), str(frames)], 0, tmp_path / "out", SMALL, PAGE)
     assert len(written) == 11
     assert set(written) == set((tmp_path / "out").iterdir())
 
 
 def test_snapshot_writes_the_sheet_and_every_panel(tmp_path: Path) -> None:
     sources = ["virtual:ball?size=320x240&frames=2", "virtual:workstation?size=320x240&frames=2"]
-    written = snapshot(sources, 1, tmp_path / "new" / "pictures", SMALL)
+    written = snapshot(sources, 1, tmp_path / "new" / "pictures", SMALL, PAGE)
     assert [path.name for path in written[:3]] == [
         "sheet.png",
         "ball-depth.png",
@@ -116,17 +151,28 @@ def test_snapshot_writes_the_sheet_and_every_panel(tmp_path: Path) -> None:
     assert len(written) == 11
     sheet = cv2.imread(str(written[0]))
     assert sheet is not None and sheet.shape[1] == 1600
+    for path in written[1:]:
+        single = cv2.imread(str(path))
+        assert single is not None and single.shape == (240, 320, 3)
+
+
+def test_an_out_that_ends_like_a_picture_is_the_sheet_alone(tmp_path: Path) -> None:
+    source = "virtual:ball?size=320x240&frames=1"
+    out = tmp_path / "pic.pdf"
+    assert snapshot([source], 0, out, SMALL, PAGE) == [out]
+    assert out.read_bytes().startswith(b"%PDF")
+    assert list(tmp_path.iterdir()) == [out]
 
 
 def test_a_frame_beyond_the_end_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="the last is --frame 1"):
-        snapshot(["virtual:ball?size=320x240&frames=2"], 2, tmp_path, SMALL)
+        snapshot(["virtual:ball?size=320x240&frames=2"], 2, tmp_path, SMALL, PAGE)
 
 
 def test_an_unwritable_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(OutputError, match="file' cannot be written: File exists"):
-        snapshot(["virtual:ball?size=320x240&frames=1"], 0, tmp_path / "file", SMALL)
+        snapshot(["virtual:ball?size=320x240&frames=1"], 0, tmp_path / "file", SMALL, PAGE)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The loop: every frame once, time kept, faults of the source survived or told."""
+"""The pipeline: every frame once, time kept, faults of the source survived or told."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from selective_depth.app.commands import run as session_module
 from selective_depth.app.commands.run import Session
 from selective_depth.app.console import interrupt
-from selective_depth.app.pipeline import Arrival, StageTimes, StateNote, Step, timing
-from selective_depth.app.pipeline.loop import MODEL_EVERY, Loop
+from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes, timing
+from selective_depth.app.pipeline.pipeline import MODEL_EVERY, Pipeline
 from selective_depth.app.settings import (
     AcquireOptions,
     GasOptions,
@@ -120,8 +120,8 @@ def test_the_rate_is_that_of_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
         time.sleep(0.1)
         return plain(timeout_s)
 
-    def show(self: Viewer, item: Step | StateNote) -> None:
-        assert isinstance(item, Step)
+    def show(self: Viewer, item: FrameResult | SensorNote) -> None:
+        assert isinstance(item, FrameResult)
         shown_s.append(time.monotonic())
         rates.append(item.figures["fps"])
 
@@ -214,57 +214,60 @@ def test_what_is_lost_while_starting_is_counted_apart(monkeypatch: pytest.Monkey
 
 def test_a_live_loop_makes_the_model_of_some_frames_only() -> None:
     settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, rounds=2))
-    with Loop(settings, realtime=True) as loop:
+    with Pipeline(settings, realtime=True) as pipeline:
         for index in range(3 * MODEL_EVERY):
-            loop.turn(make_frame(index))
-    assert 1 <= loop.times.summary()["model"].count <= 3
+            pipeline.make(make_frame(index))
+    assert 1 <= pipeline.times.summary()["model"].count <= 3
 
 
 ACQUIRING = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, rounds=2))
 
 
 def test_a_model_has_no_error_where_the_frame_has_no_depth() -> None:
-    with Loop(ACQUIRING) as loop:
-        step = loop.turn(make_frame(0))
+    with Pipeline(ACQUIRING) as pipeline:
+        step = pipeline.make(make_frame(0))
     assert step.model is not None
     np.testing.assert_array_equal(np.isnan(step.model.error_mm), step.frame.depth_mm == 0)
 
 
 def test_a_live_model_is_handed_out_once() -> None:
-    with Loop(ACQUIRING, realtime=True) as loop:
-        assert loop.turn(make_frame(0)).model is None
-        assert loop._pending is not None
-        made = loop._pending.result()
-        later = [loop.turn(make_frame(index)).model for index in range(1, MODEL_EVERY)]
+    with Pipeline(ACQUIRING, realtime=True) as pipeline:
+        assert pipeline.make(make_frame(0)).model is None
+        assert pipeline._pending is not None
+        made = pipeline._pending.result()
+        later = [pipeline.make(make_frame(index)).model for index in range(1, MODEL_EVERY)]
     assert later == [made] + [None] * (MODEL_EVERY - 2)
 
 
 def test_stage_loop_holds_what_the_loop_itself_did(monkeypatch: pytest.MonkeyPatch) -> None:
-    with Loop(SMALL) as loop:
-        loop.warm_up(make_frame(0))
-        train = loop._gas.update if loop._live_gas else loop._gas.select
+    with Pipeline(SMALL) as pipeline:
+        pipeline.warm_up(make_frame(0))
+        train = pipeline._gas.update if pipeline._live_gas else pipeline._gas.select
         # As slow as to outlast all that is done beside it.
         monkeypatch.setattr(
-            loop._gas, train.__name__, lambda seeds: (time.sleep(0.1), train(seeds))[1]
+            pipeline._gas, train.__name__, lambda seeds: (time.sleep(0.1), train(seeds))[1]
         )
-        loop.turn(make_frame(1))
-    stages = loop.times.summary()
+        pipeline.make(make_frame(1))
+    stages = pipeline.times.summary()
     assert stages["neural_gas"].max_ms >= 100
     assert stages["loop"].max_ms >= stages["seeds"].max_ms + stages["neural_gas"].max_ms
 
 
 def test_a_step_has_the_times_of_its_own_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """Though the next frame is under way when it is made."""
-    arrivals = [Arrival(make_frame(index), read_ms=float(index)) for index in range(6)]
-    with Loop(ACQUIRING) as loop:
-        loop.warm_up(make_frame(0))
-        select, calls = loop._improvement.select, itertools.count()
+    with Pipeline(ACQUIRING) as pipeline:
+        pipeline.warm_up(make_frame(0))
+        select, calls = pipeline._improvement.select, itertools.count()
         monkeypatch.setattr(
-            loop._improvement,
+            pipeline._improvement,
             "select",
             lambda seeds: (time.sleep(0.3 * (next(calls) == 3)), select(seeds))[1],
         )
-        steps = list(loop.steps(arrivals))
+        steps = []
+        for index in range(6):
+            pipeline.begin(make_frame(index), read_ms=float(index))
+            steps += pipeline.finished()
+        steps += pipeline.rest()
     assert [step.stages_ms["read"] for step in steps] == [0, 1, 2, 3, 4, 5]
     assert max(range(6), key=lambda index: steps[index].stages_ms["improvement"]) == 3
     own = {"read", "seeds", "neural_gas", "improvement", "acquire", "model", "loop"}
@@ -279,46 +282,44 @@ def test_starting_is_over_before_times_count(monkeypatch: pytest.MonkeyPatch) ->
         return plain(self, threads)
 
     monkeypatch.setattr(Acquisition, "reconstruct", slow)
-    with Loop(ACQUIRING, realtime=True) as loop:
-        loop.warm_up(make_frame(0))
-    assert loop.times.summary() == {}
+    with Pipeline(ACQUIRING, realtime=True) as pipeline:
+        pipeline.warm_up(make_frame(0))
+    assert pipeline.times.summary() == {}
 
 
 def test_a_closed_loop_leaves_no_thread() -> None:
     before = set(threading.enumerate())
-    with Loop(ACQUIRING, realtime=True) as loop:
-        loop.turn(make_frame(0))
+    with Pipeline(ACQUIRING, realtime=True) as pipeline:
+        pipeline.make(make_frame(0))
     left = {thread.name for thread in set(threading.enumerate()) - before}
     assert not [name for name in left if name.startswith(("beside", "model"))]
 
 
 @pytest.mark.parametrize(("budget", "realtime"), [(0.05, False), (0.05, True), (0.0, True)])
-def test_steps_come_in_order_and_none_is_held_back_from_silence(
+def test_results_come_in_order_and_none_is_held_back_from_silence(
     budget: float, realtime: bool
 ) -> None:
-    """Frames overlap; the steps are those of one frame at a time."""
+    """Frames overlap; the results are those of one frame at a time."""
     settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=budget, rounds=2))
+    done: list[FrameResult] = []
     ahead: list[int] = []
-    taken = 0
-
-    def frames() -> Iterator[Arrival | None]:
+    with Pipeline(settings, realtime=realtime) as pipeline, Pipeline(settings) as plain:
         for index in range(6):
-            yield Arrival(make_frame(index), f"state {index}")
-            ahead.append(index + 1 - taken)
-        yield None
-        assert taken == 6, "a step waits for a frame that does not come"
-        yield Arrival(make_frame(6), "state 6")
-
-    with Loop(settings, realtime=realtime) as loop, Loop(settings) as plain:
-        for index, step in enumerate(loop.steps(frames())):
-            taken += 1
-            expected = plain.turn(make_frame(index))
-            assert (step.frame.index, step.state) == (index, f"state {index}")
-            np.testing.assert_array_equal(step.regions.mask, expected.regions.mask)
-            np.testing.assert_array_equal(step.improvement.score, expected.improvement.score)
-            if step.acquisition is not None and expected.acquisition is not None:
-                np.testing.assert_array_equal(step.acquisition.uv, expected.acquisition.uv)
-    assert taken == 7
+            pipeline.begin(make_frame(index), state=f"state {index}")
+            done += pipeline.finished()
+            ahead.append(index + 1 - len(done))
+        done += pipeline.rest()  # none comes for a while
+        assert len(done) == 6, "a result waits for a frame that does not come"
+        pipeline.begin(make_frame(6), state="state 6")
+        done += pipeline.rest()
+        for index, result in enumerate(done):
+            expected = plain.make(make_frame(index))
+            assert (result.frame.index, result.state) == (index, f"state {index}")
+            np.testing.assert_array_equal(result.regions.mask, expected.regions.mask)
+            np.testing.assert_array_equal(result.improvement.score, expected.improvement.score)
+            if result.acquisition is not None and expected.acquisition is not None:
+                np.testing.assert_array_equal(result.acquisition.uv, expected.acquisition.uv)
+    assert len(done) == 7
     assert max(ahead) == (1 if budget or not realtime else 0)
 
 
@@ -336,7 +337,7 @@ def test_replay_that_times_out_is_an_error(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_source_is_closed_when_a_selector_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     source = Script([0, 1])
-    monkeypatch.setattr(Loop, "turn", lambda *_: (_ for _ in ()).throw(MemoryError("full")))
+    monkeypatch.setattr(Pipeline, "make", lambda *_: (_ for _ in ()).throw(MemoryError("full")))
     with pytest.raises(MemoryError):
         run(monkeypatch, source)
     assert source.closed == 1

@@ -26,7 +26,7 @@ from rerun_listener import Listener
 from selective_depth.app import cli
 from selective_depth.app.console.errors import UsageError, ViewerError
 from selective_depth.app.pictures import palette as legend
-from selective_depth.app.pipeline import STAGES, Model, StageTimes, StateNote, Step
+from selective_depth.app.pipeline import STAGES, FrameResult, Model, SensorNote, StageTimes
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer import recording as viewer
 from selective_depth.app.viewer import sinks as places
@@ -41,7 +41,7 @@ HEIGHT, WIDTH = 48, 64
 HEADLESS = ViewerOptions(headless=True)
 
 
-def make_step(index: int, *, acquiring: bool = True) -> Step:
+def make_step(index: int, *, acquiring: bool = True) -> FrameResult:
     """A small step with holes, made by hand: the viewer is tested, not the selectors."""
     rng = np.random.default_rng(index)
     depth_mm = rng.integers(600, 4000, (HEIGHT, WIDTH)).astype(np.uint16)
@@ -73,7 +73,7 @@ def make_step(index: int, *, acquiring: bool = True) -> Step:
         )
         error_mm = np.where(known, 12.5, np.nan).astype(np.float32)
         model = Model(depth_mm.astype(np.float32), error_mm, 12.5)
-    return Step(
+    return FrameResult(
         frame,
         seeds,
         regions,
@@ -85,7 +85,7 @@ def make_step(index: int, *, acquiring: bool = True) -> Step:
     )
 
 
-def save(path: Path, steps: list[Step], **options: Any) -> None:
+def save(path: Path, steps: list[FrameResult], **options: Any) -> None:
     chosen = dataclasses.replace(HEADLESS, save=path, **options)
     shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=100)
     for step in steps:
@@ -165,10 +165,10 @@ def test_every_view_shows_something_that_was_logged(
 def test_sensor_state_is_logged_when_it_changes(tmp_path: Path) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
     shown = places.Viewer(chosen, live=False, times=StageTimes(), frames=100)
-    shown.show(StateNote("lost"))  # before the first frame there is no time to log it at
+    shown.show(SensorNote("lost"))  # before the first frame there is no time to log it at
     shown.show(make_step(0))
     for state in ("stalled", "stalled", "lost", "reconnecting"):
-        shown.show(StateNote(state))
+        shown.show(SensorNote(state))
     shown.show(make_step(1))
     assert shown.close() == []
     states = []
@@ -252,7 +252,7 @@ def test_a_recording_waits_for_its_file_and_a_sensor_for_nothing(
     go_on = threading.Event()
     plain = viewer.Recording.log
 
-    def slow(self: viewer.Recording, item: Step | StateNote) -> None:
+    def slow(self: viewer.Recording, item: FrameResult | SensorNote) -> None:
         if live:
             go_on.wait()
         else:
@@ -339,7 +339,7 @@ def listener() -> Iterator[Listener]:
     made.kill()
 
 
-def show_for(shown: places.Viewer, seconds: float, step: Step) -> tuple[int, float]:
+def show_for(shown: places.Viewer, seconds: float, step: FrameResult) -> tuple[int, float]:
     """Show steps for a while; return how many and the longest time that one took."""
     count, longest_s = 0, 0.0
     end_s = time.monotonic() + seconds

@@ -28,10 +28,14 @@ def code_lines(path: Path) -> int:
     for node in ast.walk(ast.parse(text)):
         body = getattr(node, "body", None)
         for statement in body if isinstance(body, list) else []:
-            if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
-                if isinstance(statement.value.value, str):
-                    lines.difference_update(range(statement.lineno, statement.end_lineno + 1))
+            if isinstance(statement, ast.Expr) and is_text(statement.value):
+                lines.difference_update(range(statement.lineno, (statement.end_lineno or 0) + 1))
     return len(lines)
+
+
+def is_text(node: ast.expr) -> bool:
+    """Whether an expression is a plain string: on a line of its own, a docstring."""
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
 
 
 if __name__ == "__main__":

@@ -1,20 +1,20 @@
-"""One turn of the loop: a frame in; seeds, both selectors, the samples and the model out."""
+"""One frame's way: seeds, both selectors, the samples and the model, side by side and timed."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.pipeline.result import Arrival, Model, Step
+from selective_depth.app.pipeline.result import FrameResult, Model
 from selective_depth.app.pipeline.timing import StageTimes
 from selective_depth.app.pipeline.warm_up import compiling_beside
 from selective_depth.app.settings import Settings
@@ -38,47 +38,21 @@ def _as_options(section: str) -> Iterator[None]:
         raise UsageError(f"--{section}.{error}.") from None
 
 
-@dataclass(frozen=True, eq=False)
-class _Turn:
-    """A frame under way: what is made of it, and what is being made.
-
-    Parameters
-    ----------
-    frame : DepthFrame
-        What the sensor delivered.
-    state : str
-        The sensor's.
-    seeds : SeedGrid
-        The first measurements.
-    regions : RegionSelection
-        What the neural gas selected.
-    improving, modelling : Future
-        The other parts, in threads beside the loop.
-    begun_ms : float
-        How long the loop was busy with it so far.
-    stages_ms : dict of str to float
-        Duration of each stage that is done.
-    """
-
-    frame: DepthFrame
-    state: str
-    seeds: SeedGrid
-    regions: RegionSelection
-    improving: Future[ImprovementSelection]
-    modelling: Future[tuple[Acquisition | None, Model | None]]
-    begun_ms: float
-    stages_ms: dict[str, float]
-
-
-class Loop:
+class Pipeline:
     """Both selectors and the acquisition, frame by frame, every stage timed.
+
+    Frames are put in with `begin` and taken out, in their order, with `finished` and `rest`.
+    While one is made the next is begun: two frames with a thread for each of their parts keep two
+    processors busier than one frame whose every part waits for its slowest thread. Only a
+    sensor's frames of which nothing is acquired are made one by one: they are ready long before
+    the next one comes, and so are seen at once.
 
     Parameters
     ----------
     settings : Settings
         Options of the seeds, the selectors and the acquisition.
     realtime : bool, default False
-        Frames come whether the loop is ready or not. Then the dense model of every
+        Frames come whether the pipeline is ready or not. Then the dense model of every
         `MODEL_EVERY`-th is made beside it, and the other frames have none.
 
     Raises
@@ -90,8 +64,7 @@ class Loop:
     def __init__(self, settings: Settings, *, realtime: bool = False) -> None:
         gas, improvement = settings.gas, settings.improvement
         self._overlap = int(settings.acquire.budget > 0 or not realtime)
-        threads = settings.run.threads or (1 if self._overlap else None)
-        self._threads = threads
+        self._threads = settings.run.threads or (1 if self._overlap else None)
         self.times = StageTimes()
         self._settings = settings
         self._live_gas = gas.training == "live"
@@ -103,86 +76,94 @@ class Loop:
                 seed=gas.seed,
                 edge_metric=gas.edge_metric,
                 factor=gas.factor,
-                threads=threads,
+                threads=self._threads,
             )
         with _as_options("improvement"):
             self._improvement = ImprovementSelector(
-                share=improvement.share, exponent=improvement.exponent, threads=threads
+                share=improvement.share, exponent=improvement.exponent, threads=self._threads
             )
         self._realtime = realtime
         # The stages are compiled and free of the GIL: side by side they take as long as the
         # longest of them.
         self._beside = ThreadPoolExecutor(2, thread_name_prefix="beside")
         self._modelling = ThreadPoolExecutor(1, thread_name_prefix="model")
+        self._under_way: deque[Callable[[], FrameResult]] = deque()
         self._pending: Future[Model] | None = None
         self._since_model = MODEL_EVERY
 
     def warm_up(self, frame: DepthFrame) -> None:
         """Compile the kernels, fill the tables and train the first nodes, untimed."""
-        options = self._settings.seeds
         with compiling_beside():
-            self._improvement.select(SeedGrid.from_frame(frame, (options.rows, options.columns)))
-        self.turn(frame)
+            self._improvement.select(self._seeds(frame))
+        self.make(frame)
         if self._pending is not None:
             self._pending.result()
         self.times.clear()
 
-    def turn(self, frame: DepthFrame, state: str = "replay") -> Step:
-        """Make all of a frame that there is to make."""
-        return self._end(self._begin(Arrival(frame, state)))
+    def make(self, frame: DepthFrame) -> FrameResult:
+        """Make all of one frame that there is to make; nothing else may be under way."""
+        self.begin(frame)
+        return next(self.rest())
 
-    def steps(self, frames: Iterable[Arrival | None]) -> Iterator[Step]:
-        """Turn all of these frames, each with its sensor's state; None where none came in time.
+    def begin(self, frame: DepthFrame, *, state: str = "replay", read_ms: float = math.nan) -> None:
+        """Take a frame's seeds, set the rest going, and train the nodes meanwhile.
 
-        While one is made, the next is begun: two frames with a thread for each of their parts keep
-        two processors busier than one frame whose every part waits for its slowest thread. Only a
-        sensor's frames of which nothing is acquired are made one by one: they are ready long
-        before the next one comes, and so are seen at once.
+        Parameters
+        ----------
+        frame : DepthFrame
+            What the source delivered.
+        state : str, default "replay"
+            The sensor's.
+        read_ms : float, default NaN
+            How long the frame was waited for.
         """
-        under_way: deque[_Turn] = deque()
-        for each in frames:
-            if each is not None:
-                under_way.append(self._begin(each))
-            while len(under_way) > (0 if each is None else self._overlap):
-                yield self._end(under_way.popleft())
-        while under_way:
-            yield self._end(under_way.popleft())
-
-    def _begin(self, arrival: Arrival) -> _Turn:
-        """Take a frame's seeds, set the rest going, and train the nodes meanwhile."""
         start_s = time.perf_counter()
-        frame, stages_ms = arrival.frame, {"read": arrival.read_ms}
+        stages_ms = {"read": read_ms}
+        if math.isfinite(read_ms):
+            self.times.add("read", read_ms)
         with self.times.stage("seeds", stages_ms):
-            options = self._settings.seeds
-            seeds = SeedGrid.from_frame(frame, (options.rows, options.columns))
+            seeds = self._seeds(frame)
         modelling = self._beside.submit(self._acquire_and_model, frame, seeds, stages_ms)
         improving = self._beside.submit(self._improve, seeds, stages_ms)
         # In this thread, for the training of a frame begins where the last one's ended.
         regions = self._regions(seeds, stages_ms)
         begun_ms = (time.perf_counter() - start_s) * 1000
-        return _Turn(
-            frame, arrival.state, seeds, regions, improving, modelling, begun_ms, stages_ms
-        )
 
-    def _end(self, turn: _Turn) -> Step:
-        """Wait until all of a frame is made; stage "loop" is the time in `_begin` and here."""
-        start_s = time.perf_counter()
-        improvement = turn.improving.result()
-        acquisition, model = turn.modelling.result()
-        if acquisition is not None and model is None:
-            model = self._model_of_some(turn.frame, acquisition)
-        loop_ms = turn.begun_ms + (time.perf_counter() - start_s) * 1000
-        self.times.add("loop", loop_ms)
-        return Step(
-            frame=turn.frame,
-            seeds=turn.seeds,
-            regions=turn.regions,
-            improvement=improvement,
-            acquisition=acquisition,
-            model=model,
-            state=turn.state,
-            stages_ms=turn.stages_ms | {"loop": loop_ms},
-        )
+        def finish() -> FrameResult:
+            """Wait until all of it is made; stage "loop" is the time in `begin` and here."""
+            start_s = time.perf_counter()
+            improvement = improving.result()
+            acquisition, model = modelling.result()
+            if acquisition is not None and model is None:
+                model = self._model_of_some(frame, acquisition)
+            loop_ms = begun_ms + (time.perf_counter() - start_s) * 1000
+            self.times.add("loop", loop_ms)
+            return FrameResult(
+                frame=frame,
+                seeds=seeds,
+                regions=regions,
+                improvement=improvement,
+                acquisition=acquisition,
+                model=model,
+                state=state,
+                stages_ms=stages_ms | {"loop": loop_ms},
+            )
+
+        self._under_way.append(finish)
+
+    def finished(self) -> Iterator[FrameResult]:
+        """Results that need not wait for another frame to be begun."""
+        while len(self._under_way) > self._overlap:
+            yield self._under_way.popleft()()
+
+    def rest(self) -> Iterator[FrameResult]:
+        """Results of all frames under way: at the end, or when no other frame is in sight."""
+        while self._under_way:
+            yield self._under_way.popleft()()
+
+    def _seeds(self, frame: DepthFrame) -> SeedGrid:
+        options = self._settings.seeds
+        return SeedGrid.from_frame(frame, (options.rows, options.columns))
 
     def _regions(self, seeds: SeedGrid, stages_ms: dict[str, float]) -> RegionSelection:
         with self.times.stage("neural_gas", stages_ms):

@@ -1,0 +1,191 @@
+"""Pictures as files: panels in rows on a page, drawn by matplotlib, in the format of the ending.
+
+Matplotlib is imported when something is drawn, since that takes half a second, and only its objects
+are used, never `pyplot`: nothing is kept from one picture to the next and no display is touched.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from selective_depth.app.console.output import write_output
+from selective_depth.app.pictures import palette
+from selective_depth.app.pictures.panels import Panel, StillRow, hexadecimal, panels_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH_IN = 16.0
+"""Width of a page; all sizes below, in inches, and those of the type, in points, are for it."""
+DPI = 100
+INK, PALE = "#1e2228", "#6a7078"
+_GAP, _TITLE, _CAPTION, _FOOT, _LEGEND = 0.18, 0.46, 0.34, 0.46, 0.36
+_BAR = 0.34
+"""Width of a colour bar, as a share of its panel's."""
+_WEBP_QUALITY = 80
+
+Row = tuple[str, Sequence[Panel | None]]
+"""A title, and panels from left to right; None leaves a place empty."""
+
+
+def contact_sheet(rows: Sequence[StillRow], width_in: float = WIDTH_IN) -> Figure:
+    """All sources under each other, like Fig. 5 of the paper.
+
+    Parameters
+    ----------
+    rows : sequence of StillRow
+        At least one.
+    width_in : float, default 16
+        Width of the page in inches.
+    """
+    return sheet([(row.title, panels_of(row)) for row in rows], width_in)
+
+
+def sheet(rows: Sequence[Row], width_in: float = WIDTH_IN, *, legend: bool = True) -> Figure:
+    """Panels in rows, each with its caption, its colour bar and its note.
+
+    Parameters
+    ----------
+    rows : sequence of (str, sequence of Panel or None)
+        Titles, which may be empty, and panels; at least one.
+    width_in : float, default 16
+        Width of the page in inches. Type, lines and gaps grow with it.
+    legend : bool, default True
+        Explain the marks that have no scale.
+
+    Returns
+    -------
+    Figure
+        For `write_picture`.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    columns = max(len(shown) for _, shown in rows)
+    each = (WIDTH_IN - _GAP * (columns + 1)) / columns
+    heights = [
+        max(each * p.image.shape[0] / p.image.shape[1] for p in shown if p) for _, shown in rows
+    ]
+    extras = [(_TITLE if title else 0.0) + _CAPTION + _FOOT for title, _ in rows]
+    height = sum(heights) + sum(extras) + _GAP + _LEGEND * legend
+    zoom = width_in / WIDTH_IN
+    with rc_context({"text.parse_math": False}):  # a source may be called $x
+        figure = Figure(figsize=(width_in, height * zoom), facecolor="white")
+        top = height - _GAP / 2
+        for (title, shown), tall, extra in zip(rows, heights, extras, strict=True):
+            if title:
+                place = (_GAP / WIDTH_IN, (top - 0.32) / height)
+                figure.text(*place, _told(title), size=17 * zoom, weight="bold", color=INK)
+            bottom = top - extra - tall + _FOOT
+            for column, panel in enumerate(shown):
+                if panel is not None:
+                    left = _GAP + column * (each + _GAP)
+                    box = (left / WIDTH_IN, bottom / height, each / WIDTH_IN, tall / height)
+                    axes = figure.add_axes(box)
+                    _fill(axes, panel, zoom)
+                    _caption(axes, panel, each, tall, zoom)
+            top -= extra + tall
+        if legend:
+            _explain(figure, height, zoom)
+    return figure
+
+
+def alone(panel: Panel) -> Figure:
+    """One panel without caption and scale, at `DPI` as large as the frame."""
+    from matplotlib.figure import Figure
+
+    height, width = panel.image.shape[:2]
+    # A hundredth of a pixel more: what is a little less than a whole one would be cut off.
+    figure = Figure(figsize=((width + 0.01) / DPI, (height + 0.01) / DPI))
+    _fill(figure.add_axes((0, 0, 1, 1)), panel, 1.0)
+    return figure
+
+
+def write_picture(path: Path, figure: Figure, dpi: int = DPI) -> None:
+    """Write a picture whole or not at all, as PNG, WebP, PDF or SVG by the file's ending.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    figure : Figure
+        What `sheet` or `alone` made.
+    dpi : int, default 100
+        Pixels per inch; in PDF and SVG those of the images in it.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written; an older file of that name stays as it was.
+    """
+    kind = path.suffix.lower().removeprefix(".")
+    drawn = io.BytesIO()
+    encoding = {"quality": _WEBP_QUALITY} if kind == "webp" else None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a letter of some source's name that no font has
+        figure.savefig(drawn, format=kind, dpi=dpi, pil_kwargs=encoding)
+    write_output(path, drawn.getvalue())
+
+
+def _fill(axes: Axes, panel: Panel, zoom: float) -> None:
+    """Draw a panel's image and what lies over it, without a frame."""
+    height, width = panel.image.shape[:2]
+    axes.imshow(panel.image, aspect="auto", interpolation="antialiased")
+    if panel.overlay is not None:
+        panel.overlay(axes)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    axes.set_axis_off()
+
+
+def _caption(axes: Axes, panel: Panel, each: float, tall: float, zoom: float) -> None:
+    """Write a panel's caption above it; draw its colour bar, with ticks, and its note below."""
+    large, small = (13, 10) if each >= 3.5 else (11.5, 9)
+    axes.text(0, 1 + 0.09 / tall, _told(panel.caption), transform=axes.transAxes,
+              size=large * zoom, weight="bold", color=INK)  # fmt: skip
+    below: dict[str, Any] = {"transform": axes.transAxes, "size": small * zoom, "color": PALE}
+    axes.text(1, -0.2 / tall, panel.note, ha="right", **below)
+    if panel.scale is None:
+        return
+    (low, high), unit = panel.scale.limits, panel.scale.unit
+    if unit == "round":
+        colours = palette.round_colours(round(high))[1:]
+    else:
+        colours = palette.palette(panel.scale.colormap)
+    bar = axes.inset_axes((0, -0.18 / tall, _BAR, 0.1 / tall))
+    bar.imshow(palette.channels(colours)[None], aspect="auto")
+    bar.set_axis_off()
+    for text, at, side in (
+        (f"{low:g}", 0, "left"),
+        (unit, 0.5, "center"),
+        (f"{high:g}", 1, "right"),
+    ):
+        axes.text(at * _BAR, -0.34 / tall, text, ha=side, **below)
+
+
+def _explain(figure: Figure, height: float, zoom: float) -> None:
+    """Explain the marks that carry no scale of their own."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    node = Line2D([], [], marker="o", linestyle="", markersize=4 * zoom, color="white",
+                  markeredgecolor=PALE, markeredgewidth=0.6 * zoom)  # fmt: skip
+    marks = {
+        palette.UNKNOWN: Patch(color=hexadecimal(palette.HOLE)),
+        "kept triangles (edges ≤ mean)": Patch(color=hexadecimal(palette.REGION | 0xFF)),
+        "neural-gas node": node,
+    }
+    figure.legend(
+        list(marks.values()), list(marks), loc="lower left", ncols=3, frameon=False,
+        bbox_to_anchor=(_GAP / WIDTH_IN, 0.06 / height), borderpad=0, borderaxespad=0,
+        fontsize=10 * zoom, labelcolor=PALE, handlelength=1.6, columnspacing=2.2,
+    )  # fmt: skip
+
+
+def _told(text: str) -> str:
+    """A text that can be drawn: a file's name may hold bytes that are no UTF-8, or a line's end."""
+    return "".join(letter if letter.isprintable() else "�" for letter in text)
