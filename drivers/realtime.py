@@ -41,6 +41,7 @@ class RealtimeSource(DepthSource):
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         """Return the newest frame that has not been read; see `DepthSource.read`."""
+        self.check_process()
         with self._changed:
             self._asked_again = self._first_taken
             self._changed.notify_all()

@@ -71,6 +71,7 @@ class OniReader(DepthSource):
         DamagedRecordingError
             Where the file is damaged; frames already delivered are good.
         """
+        self.check_process()
         if self._file is None:
             raise SourceEndedError(f"'{self.uri}' has been closed.")
         if self._next == len(self._frames):
@@ -85,6 +86,7 @@ class OniReader(DepthSource):
             self._frames = self._frames[: self._next]
             self._damage = f"byte {frame.record_offset}: frame {frame.number} cannot be decoded"
             raise DamagedRecordingError(self._sentence(self._damage))
+        depth_mm.flags.writeable = False  # handed over: the frame need not copy it
         index = self._next
         self._next += 1
         return DepthFrame(depth_mm, index, frame.timestamp_us, self.camera, self.uri)
