@@ -137,6 +137,7 @@ class FilePlace(Place):
         if not _lock(self._held):
             raise OutputError(f"another run is writing '{path}'; name another file.")
         if free < 2 * SPARE_BYTES:
+            self.discard()
             raise OutputError(
                 f"'{path}' cannot be written: {free >> 20} MiB are free there, and a run leaves"
                 f" {SPARE_BYTES >> 20} MiB of a disk alone. Make room, or name a file elsewhere."
