@@ -18,9 +18,10 @@ from selective_depth.selectors.improvement import (
     improvement_scattered,
 )
 from selective_depth.selectors.neural_gas import NeuralGasSelector, RegionSelection
-from selective_depth.selectors.reconstruct import nearest_sample, reconstruct
+from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.triangulation import nearest_sample
 
 Pixels = npt.NDArray[np.int32]
 ORACLE_BATCHES = 16
@@ -72,9 +73,8 @@ class Case:
         valid[self.seeds.uv[:, 1], self.seeds.uv[:, 0]] = True
         if not valid.any():
             return np.full(self.frame.shape, np.inf, np.float32)
-        nearest = nearest_sample(valid)
-        rows, columns = np.indices(self.frame.shape)
-        gap = np.hypot(nearest[..., 0] - columns, nearest[..., 1] - rows)
+        _, gap_sq = nearest_sample(valid)
+        gap = np.sqrt(gap_sq)
         return np.asarray(gap, dtype=np.float32)
 
     @cached_property
