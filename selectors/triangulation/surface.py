@@ -127,11 +127,11 @@ def _draw(
     """Draw triangles into the model: those that bridge nothing linearly, the others not at all.
 
     Pixels on the edge that a bridge shares with a plain triangle are the plain one's, and a sample
-    is a plain triangle's corner or as good as one: whichever triangle is drawn last, they are alike.
+    counts as plain. So whichever triangle is drawn last, the model is the same.
     """
     width = layers.depth_mm.shape[1]
     step_mm, bridge_px = limits
-    plain = np.empty(3, np.bool_)
+    plain, owned = np.empty(3, np.bool_), np.empty(3, np.bool_)
     for t in changed:
         a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
         u0, v0, u1, v1, u2, v2 = uv[a, 0], uv[a, 1], uv[b, 0], uv[b, 1], uv[c, 0], uv[c, 1]
@@ -139,11 +139,14 @@ def _draw(
         mean = (z0 + z1 + z2) / np.float32(3)
         spread = ((z0 - mean) ** 2 + (z1 - mean) ** 2 + (z2 - mean) ** 2) / np.float32(3)
         bridge = _bridges(uv, z_mm, tri[t], step_mm, bridge_px)
-        if bridge:
-            for k in range(3):
-                o = tri[adj[t, k]]
-                hull = o[0] == GHOST or o[1] == GHOST or o[2] == GHOST
-                plain[k] = not hull and not _bridges(uv, z_mm, o, step_mm, bridge_px)
+        for k in range(3):
+            o = tri[adj[t, k]]
+            hull = o[0] == GHOST or o[1] == GHOST or o[2] == GHOST
+            plain[k] = bridge and not hull and not _bridges(uv, z_mm, o, step_mm, bridge_px)
+            # Of two triangles, the edge's pixels are that one's which it bounds from above.
+            begin, end = tri[t, (k + 1) % 3], tri[t, (k + 2) % 3]
+            du, dv = uv[end, 0] - uv[begin, 0], uv[end, 1] - uv[begin, 1]
+            owned[k] = hull or dv > 0 or (dv == 0 and du > 0)
         area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)  # positive: they run anticlockwise
         for v in range(min(v0, v1, v2), max(v0, v1, v2) + 1):
             for u in range(min(u0, u1, u2), max(u0, u1, u2) + 1):
@@ -152,11 +155,16 @@ def _draw(
                 w0 = area - w1 - w2
                 if w0 < 0 or w1 < 0 or w2 < 0:
                     continue
-                layers.spread_mm2[v, u] = spread
+                if layers.samples_mm[v, u] > 0:
+                    layers.plain[v, u] = True
+                    layers.depth_mm[v, u] = layers.samples_mm[v, u]
+                    layers.spread_mm2[v, u] = 0
+                    continue
+                if (w0 > 0 or owned[0]) and (w1 > 0 or owned[1]) and (w2 > 0 or owned[2]):
+                    layers.spread_mm2[v, u] = spread
                 edge = (w0 == 0 and plain[0]) or (w1 == 0 and plain[1]) or (w2 == 0 and plain[2])
-                plainly = not bridge or edge or layers.samples_mm[v, u] > 0
-                layers.plain[v, u] = plainly
-                if not plainly:
+                layers.plain[v, u] = edge or not bridge
+                if bridge and not edge:
                     near = layers.nearest[v, u]
                     layers.depth_mm[v, u] = layers.samples_mm[near // width, near % width]
                 else:
