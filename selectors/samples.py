@@ -10,8 +10,8 @@ from numba import njit
 
 from selective_depth.drivers.frame import Camera
 from selective_depth.selectors.arrays import sample_pairs
-from selective_depth.selectors.reconstruct import nearest_sample
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.triangulation import FAR_SQ, nearest_sample
 
 MISSED = np.float32(-1)
 """In an image of samples: measured, but nothing returned."""
@@ -180,12 +180,9 @@ class Samples:
 
     def gap_px(self) -> npt.NDArray[np.float32]:
         """Distance of every pixel to the nearest return, (H, W); infinite if there is none."""
-        nearest = nearest_sample(self.image_mm > 0)
-        rows, columns = np.indices(self.frame_shape, np.int32)
-        gap: npt.NDArray[np.float32] = np.hypot(
-            nearest[..., 0] - columns, nearest[..., 1] - rows, dtype=np.float32
-        )
-        gap[nearest[..., 0] < 0] = np.inf
+        _, gap_sq = nearest_sample(self.image_mm > 0)
+        gap = np.sqrt(gap_sq, dtype=np.float32)
+        gap[gap_sq == FAR_SQ] = np.inf
         return gap
 
     def open(self) -> npt.NDArray[np.bool_]:
