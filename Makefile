@@ -27,7 +27,6 @@ $(VENV)/.tests-installed: pyproject.toml $(VENV)/.installed
 	@touch $@
 
 run: $(VENV)/.installed ## Replay the bundled recording: a viewer, or files where there is no display
-	@.ci/system-packages libopenni2-0 || echo "Going on without: the recording's PNG twin is replayed instead."
 	@[ -z "$$DISPLAY$$WAYLAND_DISPLAY" ] || .ci/system-packages $(WINDOW_PACKAGES) || echo "Going on without: where there is no graphics driver, the run is saved to a file."
 	@$(BIN)/selective-depth replay --budget 0.05 --rounds 4
 

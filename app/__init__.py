@@ -1,6 +1,7 @@
 """The command, the loop, the viewer and the reports."""
 
 import os
+from typing import TYPE_CHECKING
 
 from selective_depth.app.kernel_cache import settle_cache
 
@@ -10,3 +11,15 @@ from selective_depth.app.kernel_cache import settle_cache
 os.environ.setdefault("MIMALLOC_PURGE_DELAY", "10")
 
 settle_cache()
+
+if TYPE_CHECKING:
+    __version__: str
+
+
+def __getattr__(name: str) -> str:
+    """The version, read when it is asked for: that takes longer than all the rest here."""
+    if name != "__version__":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib.metadata import version
+
+    return version("selective-depth")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from selective_depth.app.console import interrupt
+from selective_depth.app.console.exit_codes import INTERRUPTED
 
 
 def main() -> NoReturn:
@@ -25,7 +26,7 @@ def main() -> NoReturn:
             from selective_depth.app.cli import run
     except KeyboardInterrupt:
         _say("interrupted.")
-        _leave(interrupt.EXIT_CODE)
+        _leave(INTERRUPTED)
     _leave(run(sys.argv[1:]))
 
 

@@ -1,43 +1,36 @@
-"""The command `selective-depth`: its subcommands, its errors and its exit codes."""
+"""The commands of `selective-depth`: a signature is a command line, its docstring the help.
+
+Each imports what does its work when it is called, so that the help is there at once.
+"""
 
 from __future__ import annotations
 
-import logging
-import os
-import re
-import shutil
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import arg
 
-from selective_depth.app.console import interrupt
-from selective_depth.app.console.command import (
-    PROGRAM,
-    command,
-    completion,
-    invoke,
-    overview,
-    settings_arguments,
-)
-from selective_depth.app.console.errors import AppError, UsageError
+from selective_depth.app.console import dispatch
+from selective_depth.app.console.command import PROGRAM, command
 from selective_depth.app.settings import (
     AcquireOptions,
+    Count,
     Flag,
     GasOptions,
     ImprovementOptions,
+    Limit,
+    Natural,
     PictureOptions,
+    Positive,
+    Rounds,
     SeedOptions,
     Settings,
+    Share,
+    TimeLimit,
     optional,
+    whole,
 )
-
-OK, FAILED, MISUSED, INTERRUPTED = 0, 1, 2, interrupt.EXIT_CODE
-OPTION = re.compile(r"--[\w.-]*\w")
-NARROWEST = 40
-"""Columns; in fewer, the parser's help can take for ever to find its line breaks."""
 
 EXAMPLES = (
     (f"{PROGRAM} replay virtual:workstation", "a made scene, in the viewer"),
@@ -50,6 +43,7 @@ EXAMPLES = (
 Source = Annotated[str, arg(metavar="SOURCE")]
 SourceOrSample = Annotated[str | None, optional("SOURCE")]
 Options = Annotated[Settings, arg(name="")]
+Acquiring = Annotated[AcquireOptions, arg(name="")]
 Page = Annotated[PictureOptions, arg(name="")]
 DEFAULTS, PAGE = Settings(), PictureOptions()
 
@@ -109,8 +103,8 @@ def record(
     out: Annotated[Path, arg(metavar="OUT.oni")],
     device: Annotated[str, optional("DEVICE")] = "",
     /,
-    frames: Annotated[int | None, optional("N")] = None,
-    seconds: Annotated[float | None, optional("SECONDS")] = None,
+    frames: Limit = None,
+    seconds: TimeLimit = None,
     overwrite: Flag = False,
 ) -> int:
     """Record a sensor to an .oni file, and make sure that every frame is in it.
@@ -150,7 +144,7 @@ def check(
     file: Annotated[Path, arg(metavar="FILE.oni")],
     /,
     repair: Annotated[Path | None, optional("OUT.oni")] = None,
-    timeout: Annotated[float, arg(metavar="SECONDS")] = 10.0,
+    timeout: Annotated[Positive, arg(metavar="SECONDS")] = 10.0,
 ) -> int:
     """Say whether a recording is whole; needs no OpenNI2.
 
@@ -178,7 +172,7 @@ def export(
     source: Source,
     out: Annotated[Path, arg(metavar="OUT")],
     /,
-    frames: Annotated[int | None, optional("N")] = None,
+    frames: Limit = None,
 ) -> int:
     """Save the frames of a source as PNG files, or as an .oni file; needs no OpenNI2.
 
@@ -204,11 +198,11 @@ def model(
     source: Source,
     out: Annotated[Path, arg(metavar="DIR")],
     /,
-    frame: Annotated[int, arg(metavar="N")] = 0,
-    budget: Annotated[float, arg(metavar="SHARE")] = 0.05,
-    rounds: Annotated[int, arg(metavar="N")] = 8,
+    frame: Natural = 0,
+    budget: Annotated[Share, arg(metavar="SHARE")] = 0.05,
+    rounds: Rounds = 8,
     seeds: SeedOptions = DEFAULTS.seeds,
-) -> None:
+) -> int:
     """Acquire one frame selectively and save the model: cloud.ply, depth.png, samples.npz.
 
     Parameters
@@ -226,17 +220,9 @@ def model(
     seeds
         The seed lattice.
     """
-    from selective_depth.app.commands.model import save_model
-    from selective_depth.app.commands.snapshot import nth_frame
-    from selective_depth.selectors.acquire import acquire
-    from selective_depth.selectors.seeds import SeedGrid
+    from selective_depth.app.commands.model import model_frame
 
-    if frame < 0:
-        raise UsageError(f"--frame is {frame}; frames count from 0.")
-    full = nth_frame(source, frame)
-    grid = SeedGrid.from_frame(full, (seeds.rows, seeds.columns))
-    for path in save_model(out, acquire(full.measure, grid, budget, rounds), full.camera):
-        print(f"wrote {path}")
+    return model_frame(source, out, frame, budget, rounds, (seeds.rows, seeds.columns))
 
 
 @command(
@@ -247,7 +233,7 @@ def screenshot(
     recording: Annotated[Path, arg(metavar="FILE.rrd")],
     picture: Annotated[Path, arg(metavar="FILE.png")],
     /,
-    frame: Annotated[int | None, optional("N")] = None,
+    frame: Annotated[int | None, whole(0), optional("N")] = None,
 ) -> int:
     """Take a picture of the viewer without a display; it needs a graphics driver.
 
@@ -260,17 +246,9 @@ def screenshot(
     frame : int
         The frame to show; by default the last.
     """
-    from selective_depth.app import viewer
-    from selective_depth.app.console.output import IMAGES, check_picture, write_image
-    from selective_depth.app.console.progress import waiting
-    from selective_depth.app.pipeline import say
+    from selective_depth.app.commands.snapshot import take_screenshot
 
-    check_picture(picture, IMAGES)
-    with waiting("Loading it into the viewer"):
-        taken = viewer.screenshot(recording, frame)
-    write_image(picture, taken)
-    say(f"wrote {picture}")
-    return OK
+    return take_screenshot(recording, picture, frame)
 
 
 @command(
@@ -286,13 +264,13 @@ def snapshot(
     sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
     out: Annotated[Path, arg(metavar="DIR")] = Path("snapshot"),
-    frame: Annotated[int, arg(metavar="N")] = 0,
+    frame: Natural = 0,
     seeds: SeedOptions = DEFAULTS.seeds,
     gas: GasOptions = DEFAULTS.gas,
     improvement: ImprovementOptions = DEFAULTS.improvement,
-    acquire: Annotated[AcquireOptions, arg(name="")] = DEFAULTS.acquire,
+    acquire: Acquiring = DEFAULTS.acquire,
     page: Page = PAGE,
-) -> None:
+) -> int:
     """Write a contact sheet of one frame of each source, and every panel alone.
 
     Parameters
@@ -308,16 +286,10 @@ def snapshot(
     page
         The page.
     """
-    from selective_depth.app.commands.snapshot import snapshot as make_stills
-    from selective_depth.app.console.progress import waiting
+    from selective_depth.app.commands.snapshot import draw_snapshot
 
-    if frame < 0:
-        raise UsageError(f"--frame is {frame}; frames count from 0.")
     settings = Settings(seeds=seeds, gas=gas, improvement=improvement, acquire=acquire)
-    with waiting("Running both selectors"):
-        written = make_stills(sources, frame, out, settings, page)
-    beside = f" and {len(written) - 1} single panels beside it" if written[1:] else ""
-    print(f"wrote {written[0]}{beside}")
+    return draw_snapshot(sources, frame, out, settings, page)
 
 
 @command(
@@ -330,8 +302,8 @@ def epochs(
     /,
     out: Annotated[Path, arg(metavar="FILE")] = Path("epochs.png"),
     save: Annotated[Path | None, optional("FILE.rrd")] = None,
-    frame: Annotated[int, arg(metavar="N")] = 0,
-    seed: Annotated[int, arg(metavar="N")] = 0,
+    frame: Natural = 0,
+    seed: Natural = 0,
     page: Page = PAGE,
 ) -> int:
     """Show neural gas after 5, 10, 25, 40, 60 and 100 epochs of one frame.
@@ -364,9 +336,9 @@ def densities(
     source: Source,
     /,
     out: Annotated[Path, arg(metavar="FILE")] = Path("densities.png"),
-    frame: Annotated[int, arg(metavar="N")] = 0,
-    epochs: Annotated[int, arg(metavar="N")] = 50,
-    seed: Annotated[int, arg(metavar="N")] = 0,
+    frame: Natural = 0,
+    epochs: Count = 50,
+    seed: Natural = 0,
     page: Page = PAGE,
 ) -> int:
     """Show what neural gas finds from first scans of 32x32, 40x40, 64x64 and 75x75 points.
@@ -399,7 +371,7 @@ def densities(
 def nodes(
     source: Source,
     /,
-    every: Annotated[int | None, optional("N")] = None,
+    every: Limit = None,
     out: Annotated[Path | None, optional("FILE.md")] = None,
 ) -> int:
     """Tabulate neural gas over numbers of nodes and of epochs; takes minutes.
@@ -426,7 +398,7 @@ def nodes(
 def bench(
     source: SourceOrSample = None,
     /,
-    frames: Annotated[int | None, optional("N")] = None,
+    frames: Limit = None,
     json: Annotated[Path | None, optional("FILE")] = None,
     page: Annotated[Path | None, optional("FILE.md")] = None,
     no_peers: Flag = False,
@@ -466,13 +438,13 @@ def bench(
 def evaluate(
     sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
-    every: Annotated[int, arg(metavar="N")] = 20,
-    frames: Annotated[int | None, optional("N")] = None,
-    budget: Annotated[tuple[float, ...], arg(metavar="SHARE...")] = (0.05, 0.10),
-    rounds: Annotated[int, arg(metavar="N")] = 8,
+    every: Count = 20,
+    frames: Limit = None,
+    budget: Annotated[tuple[Share, ...], arg(metavar="SHARE...")] = (0.05, 0.10),
+    rounds: Rounds = 8,
     seeds: SeedOptions = DEFAULTS.seeds,
-    random_seeds: Annotated[int, arg(metavar="N")] = 3,
-    jobs: Annotated[int | None, optional("N")] = None,
+    random_seeds: Count = 3,
+    jobs: Limit = None,
     json: Annotated[Path | None, optional("FILE")] = None,
     picture: Annotated[Path | None, optional("FILE.png")] = None,
     page: Annotated[Path | None, optional("FILE.md")] = None,
@@ -527,88 +499,4 @@ def evaluate(
 
 def run(arguments: Sequence[str]) -> int:
     """Run a command line and return its exit code: 0, 1 failed, 2 misused, 130 interrupted."""
-    words = list(arguments)
-    debug = _take(words, "--debug")
-    verbose = _take(words, "-v", "--verbose")
-    try:
-        with interrupt.recognised():
-            return _dispatch(words, verbose)
-    except BrokenPipeError:  # whoever read the output has seen enough, as in `| head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
-    except KeyboardInterrupt:
-        _say("interrupted.")
-        return INTERRUPTED
-    except Exception as error:  # the one place where any error becomes one line
-        if debug:
-            raise
-        _say(_sentence(error))
-        return MISUSED if isinstance(error, UsageError) else FAILED
-
-
-def _dispatch(words: list[str], verbose: bool) -> int:
-    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(message)s")
-    # The viewer's SDK logs in its own way to the terminal; its warnings are told in ours.
-    os.environ.setdefault("RUST_LOG", "warn" if verbose else "off")
-    if shutil.get_terminal_size().columns < NARROWEST:
-        os.environ["COLUMNS"] = str(NARROWEST)
-    if not words or words[0] in ("-h", "--help", "help"):
-        print(overview(EXAMPLES))
-        return OK
-    if words[0] == "--version":
-        print(_versions())
-        return OK
-    if words[0] == "--completion":
-        print(completion(words[1] if len(words) > 1 else ""))
-        return OK
-    name, typed = words[0], words[1:]
-    if "--settings" not in typed:
-        return invoke(name, typed)
-    at = typed.index("--settings")
-    if at + 1 == len(typed):
-        raise UsageError("--settings needs a file: --settings FILE.toml")
-    file, typed = Path(typed[at + 1]), typed[:at] + typed[at + 2 :]
-    from_file = settings_arguments(file)
-    try:
-        # Before what was typed, so that what was typed wins.
-        return invoke(name, from_file + typed)
-    except UsageError as error:
-        if any(word in from_file and word not in typed for word in OPTION.findall(str(error))):
-            raise UsageError(f"{error} That option stands in '{file}'.") from None
-        raise
-
-
-def _take(words: list[str], *names: str) -> bool:
-    found = [word for word in words if word in names]
-    for word in found:
-        words.remove(word)
-    return bool(found)
-
-
-def _versions() -> str:
-    from importlib.metadata import version
-
-    from selective_depth.drivers.errors import SourceError
-    from selective_depth.drivers.openni import runtime_version
-
-    try:
-        runtime = f"OpenNI2 runtime {runtime_version()}"
-    except SourceError as error:
-        runtime = f"no OpenNI2 runtime: {error}"
-    return f"{PROGRAM} {version(PROGRAM)}\n{runtime}"
-
-
-def _sentence(error: Exception) -> str:
-    from selective_depth.drivers.errors import SourceError
-
-    words = " ".join(str(error).split())
-    if isinstance(error, (AppError, SourceError, ValueError, OSError)) and words:
-        return words
-    return (
-        f"unexpected {type(error).__name__}: {words or 'no message'}."
-        " Run it again with --debug to see where, and please report it."
-    )
-
-
-def _say(words: str) -> None:
-    print(f"{PROGRAM}: {words}", file=sys.stderr)
+    return dispatch.run(arguments, EXAMPLES)

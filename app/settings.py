@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
+import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
+from tyro.constructors import PrimitiveConstructorSpec
+
+MOST_ROUNDS = 254
+"""Rounds of an acquisition; those of the selectors, which are not imported for the help's sake."""
 
 Flag = Annotated[bool, arg(help_behavior_hint="")]
 """An option without a value; that it is off by default goes without saying."""
@@ -18,13 +23,67 @@ def optional(metavar: str) -> Any:
     return arg(metavar=metavar, help_behavior_hint="")
 
 
+def must_be(allowed: str, kind: Callable[[str], Any], good: Callable[[Any], object]) -> Any:
+    """Describe what an option's value must be; anything else is refused in a sentence.
+
+    Parameters
+    ----------
+    allowed : str
+        What may be given, as it follows "it must be".
+    kind : callable
+        Makes the value of what was typed, or raises ValueError.
+    good : callable
+        Whether the value is allowed.
+    """
+
+    def value_of(words: list[str]) -> Any:
+        typed = words[0]
+        try:
+            value = kind(typed)
+        except ValueError:
+            raise ValueError(f"is '{typed}'; it must be {allowed}") from None
+        if not good(value):
+            shown = repr(value) if kind is str else typed
+            raise ValueError(f"is {shown}; it must be {allowed}")
+        return value
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="N" if kind is int else kind.__name__.upper(),
+        instance_from_str=value_of,
+        is_instance=lambda value: True,
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def whole(least: int, most: int | None = None) -> Any:
+    """Describe a whole number within limits."""
+    allowed = f"{least:,} or more" if most is None else f"from {least:,} to {most:,}"
+    return must_be(allowed, int, lambda n: n >= least and (most is None or n <= most))
+
+
+Natural = Annotated[int, whole(0)]
+Count = Annotated[int, whole(1)]
+Limit = Annotated[int | None, whole(1), optional("N")]
+Rounds = Annotated[int, whole(1, MOST_ROUNDS)]
+Share = Annotated[float, must_be("a share between 0 and 1", float, lambda x: 0 <= x <= 1)]
+positive = must_be("more than 0", float, lambda x: 0 < x < float("inf"))
+Positive = Annotated[float, positive]
+TimeLimit = Annotated[float | None, positive, optional("SECONDS")]
+_SIZE = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%")
+Memory = Annotated[
+    str, must_be("a size, such as 256MiB or 25%", str, _SIZE.fullmatch), arg(metavar="SIZE")
+]
+Millimetres = Annotated[int | None, whole(0, 65535), optional("MM")]
+
+
 @dataclass(frozen=True)
 class SeedOptions:
     """The first, sparse measurements."""
 
-    rows: int = 128
+    rows: Count = 128
     """Rows of the seed lattice."""
-    columns: int = 128
+    columns: Count = 128
     """Columns of the seed lattice."""
 
 
@@ -32,19 +91,19 @@ class SeedOptions:
 class GasOptions:
     """Neural gas: where the surfaces are (section III of the paper)."""
 
-    nodes: int = 2800
+    nodes: Annotated[int, whole(1, 100_000)] = 2800
     """Number of nodes."""
-    epochs: int = 50
+    epochs: Count = 50
     """Passes over the seeds of the exact training."""
     algorithm: Literal["exact", "fast"] = "fast"
     """Cold training: the published steps, or one with no larger error in a fraction of the time."""
     training: Literal["live", "cold"] = "live"
     """Go on from the last frame's nodes, or train every frame from nothing."""
-    seed: int = 0
+    seed: Natural = 0
     """Seed of the random draws."""
     edge_metric: Literal["3d", "image"] = "3d"
     """Measure edges in millimetres in space, or in pixels in the image."""
-    factor: float = 1.0
+    factor: Positive = 1.0
     """An edge is long beyond this many mean edge lengths."""
 
 
@@ -52,19 +111,19 @@ class GasOptions:
 class ImprovementOptions:
     """Improvement map: where a measurement helps most (section IV of the paper)."""
 
-    share: float = 0.10
-    """Share of the known pixels that the mask selects, 0..1."""
-    exponent: float = 1.2
-    """Exponent w = 2 - epsilon of the semivariogram, eq. (24); between 0 and 2."""
+    share: Share = 0.10
+    """Share of the known pixels that the mask selects."""
+    exponent: Annotated[float, must_be("between 0 and 2", float, lambda w: 0 < w < 2)] = 1.2
+    """Exponent w = 2 - epsilon of the semivariogram, eq. (24)."""
 
 
 @dataclass(frozen=True)
 class AcquireOptions:
     """Spending a budget of further measurements."""
 
-    budget: Annotated[float, arg(metavar="SHARE")] = 0.0
+    budget: Annotated[Share, arg(metavar="SHARE")] = 0.0
     """Further measurements as a share of the frame's pixels, 0..1; 0 takes none."""
-    rounds: int = 2
+    rounds: Rounds = 2
     """Rounds in which they are taken, each knowing what the last one found."""
 
 
@@ -72,9 +131,9 @@ class AcquireOptions:
 class RunOptions:
     """How long and how fast."""
 
-    frames: Annotated[int | None, optional("N")] = None
+    frames: Limit = None
     """Stop after this many frames; by default at the end of the recording, or with Ctrl-C."""
-    threads: Annotated[int | None, optional("N")] = None
+    threads: Limit = None
     """Threads of each stage; by default one, or one per processor where frames do not overlap."""
     realtime: Flag = False
     """Replay at the recorded rate, the newest frame first, as a sensor would deliver."""
@@ -94,13 +153,13 @@ class ViewerOptions:
     """Where to serve it; by default on this machine only, at 9876 or the next free port."""
     connect: Annotated[str | None, optional("URL")] = None
     """Send to a viewer that is already open, for example rerun+http://127.0.0.1:9876/proxy."""
-    serve_memory: Annotated[str, arg(metavar="SIZE")] = "256MiB"
+    serve_memory: Memory = "256MiB"
     """Memory of the stream, served or the window's, for those who join late; the oldest goes."""
-    viewer_memory: Annotated[str, arg(metavar="SIZE")] = "2GiB"
+    viewer_memory: Memory = "2GiB"
     """Memory of a viewer window that is opened; then the oldest goes."""
-    near_mm: Annotated[int | None, optional("MM")] = None
+    near_mm: Millimetres = None
     """Depth at the dark end of the colour scale; by default what suits the first frame."""
-    far_mm: Annotated[int | None, optional("MM")] = None
+    far_mm: Millimetres = None
     """Depth at its bright end. Both hold for the whole run, so that colours never jump."""
     detail: Flag = False
     """Show the kriging estimate, its variance and the long-edge triangles too."""
@@ -110,9 +169,11 @@ class ViewerOptions:
 class PictureOptions:
     """Pictures; their format is that of the file's ending: .png, .webp, .pdf or .svg."""
 
-    dpi: int = 100
+    dpi: Annotated[int, whole(10, 2400)] = 100
     """Pixels per inch."""
-    width: float = 16.0
+    width: Annotated[
+        float, must_be("from 2 to 60 inches", float, lambda x: 2 <= x <= 60), arg(metavar="INCHES")
+    ] = 16.0
     """Width of the page in inches; type and lines grow with it."""
 
 
@@ -130,26 +191,3 @@ class Settings:
 
 FLAT_SECTIONS = ("run", "acquire", "viewer")
 """Sections whose options carry no prefix on the command line."""
-
-
-def to_toml(settings: Settings, heading: str) -> str:
-    """Settings as TOML that `--settings` reads back, under a commented heading."""
-    tables: dict[str, dict[str, Any]] = dataclasses.asdict(settings)
-    flat = {k: v for name in FLAT_SECTIONS for k, v in tables.pop(name).items()}
-    lines = [f"# {line}".rstrip() for line in heading.split("\n")] + _toml_lines(flat)
-    for name, table in tables.items():
-        lines += ["", f"[{name}]", *_toml_lines(table)]
-    return "\n".join(lines) + "\n"
-
-
-def _toml_lines(table: dict[str, Any]) -> list[str]:
-    return [f"{key} = {_toml_value(value)}" for key, value in table.items() if value is not None]
-
-
-def _toml_value(value: object) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, (int, float)):
-        return repr(value)
-    quoted = str(value).replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{quoted}"'

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from selective_depth.selectors.arrays import sample_pairs
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.triangulation import Mesh
 
@@ -172,8 +173,8 @@ def _draw_triangles(
 
 
 def reconstruct(
-    uv: npt.NDArray[np.integer],
-    depth_mm: npt.NDArray[np.generic],
+    uv: npt.ArrayLike,
+    depth_mm: npt.ArrayLike,
     shape: tuple[int, int],
     *,
     threads: int | None = None,
@@ -185,7 +186,7 @@ def reconstruct(
     uv : int array of shape (n, 2)
         Pixels of the samples, column first. Where one is given twice, the last counts.
     depth_mm : array of shape (n,)
-        Their depth in millimetres; 0 = no return, such samples are left out.
+        Their depth in millimetres; what is no depth (see `measured_mm`) is left out.
     shape : tuple of int
         Height and width of the image in pixels.
     threads : int, optional
@@ -201,7 +202,9 @@ def reconstruct(
     ValueError
         If the shapes do not fit together or a pixel lies outside the image.
     """
-    samples_mm = samples_image(uv, depth_mm, shape)
+    pixels, mm = sample_pairs(uv, depth_mm, shape)
+    samples_mm = np.zeros(shape, np.float32)
+    samples_mm[pixels[:, 1], pixels[:, 0]] = mm
     valid = samples_mm > 0
     if not valid.any():
         return samples_mm
@@ -220,26 +223,3 @@ def reconstruct(
         threads,
     )
     return out_mm
-
-
-def samples_image(
-    uv: npt.NDArray[np.integer], depth_mm: npt.NDArray[np.generic], shape: tuple[int, int]
-) -> npt.NDArray[np.float32]:
-    """Samples that returned depth on their pixels, float32 (H, W), 0 elsewhere; checked."""
-    uv = np.asarray(uv)
-    depth_mm = np.asarray(depth_mm)
-    height, width = shape
-    if uv.ndim != 2 or uv.shape[1] != 2 or depth_mm.shape != (len(uv),):
-        raise ValueError(
-            "samples are uv of shape (n, 2), column first, and depth_mm of shape (n,); got"
-            f" {uv.shape} and {depth_mm.shape}"
-        )
-    if len(uv) and (uv.min() < 0 or uv[:, 0].max() >= width or uv[:, 1].max() >= height):
-        raise ValueError(
-            f"a sample lies outside the image of {width}x{height} pixels: columns"
-            f" {uv[:, 0].min()} to {uv[:, 0].max()}, rows {uv[:, 1].min()} to {uv[:, 1].max()}"
-        )
-    image = np.zeros(shape, np.float32)
-    image[uv[:, 1], uv[:, 0]] = depth_mm
-    image[~(np.isfinite(image) & (image > 0))] = 0
-    return image

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.exit_codes import FAILED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pipeline import say
 from selective_depth.drivers.folder import FolderWriter
@@ -17,7 +18,6 @@ from selective_depth.drivers.oni import OniReport, OniWriter, export_oni, inspec
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.source import DepthSource
 
-OK, FAILED = 0, 1
 MOST_PROBLEMS = 20
 
 

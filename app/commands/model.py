@@ -9,10 +9,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.app.commands.snapshot import nth_frame
+from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import make_folder, write_output
 from selective_depth.app.pictures import palette
+from selective_depth.app.pipeline import say
 from selective_depth.drivers.frame import Camera
-from selective_depth.selectors.acquire import Acquisition
+from selective_depth.selectors.acquire import Acquisition, acquire
+from selective_depth.selectors.seeds import SeedGrid
 
 
 def save_cloud(path: Path, acquisition: Acquisition, camera: Camera) -> int:
@@ -114,3 +118,22 @@ def save_model(folder: Path, acquisition: Acquisition, camera: Camera) -> list[P
     save_depth(depth, acquisition.reconstruct())
     save_samples(samples, acquisition)
     return [cloud, depth, samples]
+
+
+def model_frame(
+    source: str, out: Path, number: int, budget: float, rounds: int, seeds_shape: tuple[int, int]
+) -> int:
+    """Acquire one frame of a source selectively and save the model; returns the exit code.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    UsageError
+        If there is no such frame.
+    """
+    frame = nth_frame(source, number)
+    seeds = SeedGrid.from_frame(frame, seeds_shape)
+    for path in save_model(out, acquire(frame.measure, seeds, budget, rounds), frame.camera):
+        say(f"wrote {path}")
+    return OK

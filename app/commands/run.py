@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import re
 import threading
 import time
 from collections import deque
@@ -14,6 +13,7 @@ from pathlib import Path
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pictures import StillRow, contact_sheet, write_picture
 from selective_depth.app.pipeline import (
@@ -34,14 +34,9 @@ from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.realtime import RealtimeSource
 from selective_depth.drivers.source import DepthSource
-from selective_depth.selectors.acquire import MOST_ROUNDS
 from selective_depth.selectors.parallel import default_threads
 
 log = logging.getLogger(__name__)
-
-OK, FAILED, INTERRUPTED = 0, 1, interrupt.EXIT_CODE
-MEMORY = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%")
-"""A size as the SDK reads it."""
 
 
 def watch(uri: str, settings: Settings) -> int:
@@ -67,31 +62,17 @@ def watch(uri: str, settings: Settings) -> int:
 
 
 def check(settings: Settings) -> None:
-    """Refuse options that contradict each other or lie outside their range.
+    """Refuse options that contradict each other; the range of each is in its type.
 
     Raises
     ------
     UsageError
         Naming the option, its value and what is allowed.
     """
-    run, spend, seen = settings.run, settings.acquire, settings.viewer
-    far_mm = 65535 if seen.far_mm is None else seen.far_mm
-    for option, value, allowed, good in (
-        ("--frames", run.frames, "1 or more", run.frames is None or run.frames >= 1),
-        ("--threads", run.threads, "1 or more", run.threads is None or run.threads >= 1),
-        ("--budget", spend.budget, "a share between 0 and 1", 0 <= spend.budget <= 1),
-        ("--rounds", spend.rounds, f"from 1 to {MOST_ROUNDS}", 1 <= spend.rounds <= MOST_ROUNDS),
-        ("--near-mm", seen.near_mm, "0 or more", (seen.near_mm or 0) >= 0),
-        ("--far-mm", far_mm, "more than --near-mm", far_mm > (seen.near_mm or 0)),
-    ):
-        if not good:
-            raise UsageError(f"{option} is {value}; it must be {allowed}.")
-    for option, size in (
-        ("--serve-memory", seen.serve_memory),
-        ("--viewer-memory", seen.viewer_memory),
-    ):
-        if not MEMORY.fullmatch(size):
-            raise UsageError(f"{option} is '{size}'; it must be a size, such as 256MiB or 25%.")
+    seen = settings.viewer
+    near_mm, far_mm = seen.near_mm or 0, 65535 if seen.far_mm is None else seen.far_mm
+    if far_mm <= near_mm:
+        raise UsageError(f"--far-mm is {far_mm}; it must be more than --near-mm, {near_mm}.")
     if seen.save is not None:
         _check_save(seen.save)
 
@@ -163,6 +144,7 @@ class Session:
                 source = stack.enter_context(RealtimeSource(source))
             report.live = source.live
             _tell(source)
+            report.troubles += source.notes
             pipeline = stack.enter_context(Pipeline(self.settings, realtime=source.live))
             frames = _frames_in_all(self.settings.run.frames, source.frame_count)
             viewer = self._open_viewer(pipeline, frames)

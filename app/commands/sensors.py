@@ -9,6 +9,7 @@ from rich.table import Table
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pipeline import say
 from selective_depth.drivers.openni import list_devices, runtime_version
@@ -20,7 +21,6 @@ UNKNOWN_ADVICE = (
     "Is it plugged in and powered? A Kinect for Xbox 360 needs libfreenect's OpenNI2 driver beside"
     " the others; see 'Attach a sensor' in the README."
 )
-OK, FAILED, INTERRUPTED = 0, 1, interrupt.EXIT_CODE
 
 
 def print_devices() -> int:

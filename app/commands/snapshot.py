@@ -7,9 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.output import check_picture, is_picture, make_folder
+from selective_depth.app.console.exit_codes import OK
+from selective_depth.app.console.output import (
+    IMAGES,
+    check_picture,
+    is_picture,
+    make_folder,
+    write_image,
+)
+from selective_depth.app.console.progress import waiting
 from selective_depth.app.pictures import StillRow, alone, contact_sheet, panels_of, write_picture
-from selective_depth.app.pipeline import Pipeline
+from selective_depth.app.pipeline import Pipeline, say
 from selective_depth.app.settings import PictureOptions, Settings
 from selective_depth.drivers.errors import SourceEndedError
 from selective_depth.drivers.frame import DepthFrame
@@ -101,3 +109,36 @@ def snapshot(
             written.append(out / f"{row.title}-{panel.name}.png")
             write_picture(written[-1], alone(panel), page.dpi)
     return written
+
+
+def draw_snapshot(
+    sources: Sequence[str], number: int, out: Path, settings: Settings, page: PictureOptions
+) -> int:
+    """Make a `snapshot` and say what was written; returns the exit code."""
+    with waiting("Running both selectors"):
+        written = snapshot(sources, number, out, settings, page)
+    beside = f" and {len(written) - 1} single panels beside it" if written[1:] else ""
+    say(f"wrote {written[0]}{beside}")
+    return OK
+
+
+def take_screenshot(recording: Path, picture: Path, frame: int | None) -> int:
+    """Take a picture of the viewer showing a frame, by default the last; returns the exit code.
+
+    Raises
+    ------
+    UsageError
+        If the picture is of a format that cannot be made, or the file is not a Rerun recording.
+    ViewerError
+        If the viewer does not run here.
+    OutputError
+        If the picture cannot be written.
+    """
+    from selective_depth.app import viewer
+
+    check_picture(picture, IMAGES)
+    with waiting("Loading it into the viewer"):
+        taken = viewer.screenshot(recording, frame)
+    write_image(picture, taken)
+    say(f"wrote {picture}")
+    return OK

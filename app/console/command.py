@@ -21,17 +21,18 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import functools
 import inspect
 import io
 import re
 import sys
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.settings_file import settings_arguments
 
 PROGRAM = "selective-depth"
 SHELLS = ("bash", "zsh")
@@ -126,124 +127,79 @@ def find(name: str) -> Command:
         return COMMANDS[name]
     close = difflib.get_close_matches(name, COMMANDS, n=1)
     hint = f"Did you mean '{close[0]}'?" if close else f"There are: {', '.join(COMMANDS)}."
-    raise UsageError(f"'{name}' is no command. {hint} '{PROGRAM} --help' shows examples.")
+    raise UsageError(f"there is no command '{name}'. {hint} '{PROGRAM} --help' shows examples.")
 
 
-def invoke(name: str, arguments: Sequence[str]) -> int:
-    """Parse the arguments of a command and run it.
-
-    Parameters
-    ----------
-    name : str
-        The command.
-    arguments : sequence of str
-        What was typed after it.
-
-    Returns
-    -------
-    int
-        Its exit code.
+def parse(chosen: Command, arguments: Sequence[str]) -> Callable[[], int | None]:
+    """Return a command's call with what was typed after its name, without running it.
 
     Raises
     ------
     UsageError
         If the arguments are not what the command's signature asks for.
     """
-    chosen = find(name)
-    call = parse(chosen, arguments)
-    return call() or 0
-
-
-def parse(chosen: Command, arguments: Sequence[str]) -> Callable[[], int | None]:
-    """Return a command's call with its arguments, without running it.
-
-    Raises
-    ------
-    UsageError
-        As for `invoke`.
-    """
     import tyro
 
-    received: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
+    # The parser gets a call for a result. Run inside it, a command's own output and errors would
+    # be mistaken for the parser's.
+    @functools.wraps(chosen.run)
+    def bound(*args: Any, **kwargs: Any) -> Any:
+        return functools.partial(chosen.run, *args, **kwargs)
 
-    # The function itself runs outside the parser, so that its own output and errors are
-    # not mistaken for the parser's.
-    def receive(*args: Any, **kwargs: Any) -> None:
-        received.append((args, kwargs))
-
-    receive.__signature__ = inspect.signature(chosen.run)  # type: ignore[attr-defined]
-    receive.__annotations__ = chosen.run.__annotations__
-    receive.__doc__ = chosen.run.__doc__
-    receive.__module__ = chosen.run.__module__
-    receive.__wrapped__ = chosen.run  # type: ignore[attr-defined]
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            tyro.cli(
-                receive,
+            call: Callable[[], int | None] = tyro.cli(
+                bound,
                 prog=f"{PROGRAM} {chosen.name}",
                 description=chosen.description,
                 args=list(arguments),
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
     except SystemExit as stop:
-        if stop.code == 0 or stop.code is None:
+        if not stop.code:
             raise
         raise UsageError(_one_line(complaint.getvalue(), chosen.name)) from None
-    args, kwargs = received[0]
-    return lambda: chosen.run(*args, **kwargs)
+    return call
 
 
-def _one_line(boxed: str, name: str) -> str:
-    """What the parser drew as a box, as one sentence."""
-    body = boxed.partition("For full helptext")[0].replace("(required)", "")
-    words = " ".join(re.sub(r"╭.*╮|╰.*╯|[│─]", " ", body).split())
-    # Of a value of the wrong type the parser tells how it tried each type; the first line is it.
-    words = re.sub(
-        r"^Error parsing (\S+):.* instantiated from \['(.*?)'\]\..*",
-        r"\1 is '\2', which is no value for it",
-        words.partition(" Argument helptext:")[0],
-    )
-    words = re.sub(rf"^Missing from {PROGRAM} {name}: ", "missing: ", words)
-    return f"{words.rstrip('.')}. '{PROGRAM} {name} --help' shows what it takes."
-
-
-def settings_arguments(path: Path) -> list[str]:
-    """Options of a TOML settings file, as the command line would give them.
-
-    Each key is an option's name with underscores or dashes, each table its prefix:
-    ``[gas]`` / ``nodes = 2000`` is ``--gas.nodes 2000``. So every check and every message
-    of the command line holds for files too.
+def parse_with_settings(
+    chosen: Command, arguments: Sequence[str], file: Path
+) -> Callable[[], int | None]:
+    """As `parse`, with the options of a settings file where they are not typed.
 
     Raises
     ------
     UsageError
-        If the file cannot be read or is no TOML.
+        As for `parse`; names the file if what is wrong stands there.
     """
+    parameters = inspect.signature(chosen.run).parameters
+    defaults = {name: each.default for name, each in parameters.items()}
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UsageError(
-            f"settings file '{path}' does not exist. A run with --save writes one to start from."
-        ) from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UsageError(f"settings file '{path}' cannot be read: {error}.") from None
-    return list(_flatten(table, ""))
+        # Before what was typed, so that what was typed wins.
+        return parse(chosen, [*settings_arguments(file, defaults), *arguments])
+    except UsageError as error:
+        parse(chosen, arguments)  # or is it what was typed that is wrong?
+        raise UsageError(f"{error} That option stands in '{file}'.") from None
 
 
-def _flatten(table: dict[str, Any], prefix: str) -> list[str]:
-    arguments: list[str] = []
-    for key, value in table.items():
-        option = f"--{prefix}{key.replace('_', '-')}"
-        if isinstance(value, dict):
-            arguments += _flatten(value, f"{prefix}{key.replace('_', '-')}.")
-        elif value is True:
-            arguments.append(option)
-        elif isinstance(value, list):
-            arguments += [option, *map(str, value)]
-        elif value is not False:
-            arguments += [option, str(value)]
-    return arguments
+def _one_line(boxed: str, name: str) -> str:
+    """What the parser drew as a box under a title, as one sentence."""
+    lines = [re.sub("[╭╮╰╯│─]", "", line).strip() for line in boxed.splitlines()]
+    words = " ".join([line for line in lines if line.strip("-")][1:])
+    words = re.split(r" (?:Argument|For full) helptext", words)[0].replace("(required)", "")
+    for parsers, ours in (
+        (r"^Error parsing (\S+): is ", r"\1 is "),  # the rest is ours already, of settings.py
+        # Of a value of the wrong type it tells how it tried each type.
+        (r"^Error parsing (\S+):.* instantiated from \['(.*?)'\]\..*", r"\1 cannot be '\2'"),
+        (r"^Missing value for argument '(\S+)'.*", r"\1 needs a value"),
+        (r"^Unrecognized options: (.*?) Perhaps you meant: (\S+).*", r"\1: did you mean \2?"),
+        (r"^Unrecognized options: ", f"'{name}' does not take "),
+        (rf"^Missing from {PROGRAM} {name}: ", "missing: "),
+    ):
+        words = re.sub(parsers, ours, words)
+    stop = "" if words.endswith("?") else "."
+    return f"{words.rstrip('. ')}{stop} '{PROGRAM} {name} --help' shows what it takes."
 
 
 def completion(shell: str) -> str:
@@ -255,7 +211,7 @@ def completion(shell: str) -> str:
         If the shell is not one of `SHELLS`.
     """
     if shell not in SHELLS:
-        raise UsageError(f"no completion for '{shell}'. There is one for: {', '.join(SHELLS)}.")
+        raise UsageError(f"completion is there for {' and '.join(SHELLS)}, not for '{shell}'.")
     import tyro
 
     script = io.StringIO()

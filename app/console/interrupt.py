@@ -17,11 +17,17 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-EXIT_CODE = 130
+from selective_depth.app.console.exit_codes import INTERRUPTED
+
 LEAVE_S = 2.8
 """How long after Ctrl-C the program is gone at the latest."""
 SAVE_S = 15.0
 """The same while a recording is being written, which must not be cut off."""
+
+SIGNALS = [
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+]
+"""What ends a run in good order; Windows has no SIGHUP."""
 
 _asked = threading.Event()
 _patience_s = LEAVE_S
@@ -29,9 +35,11 @@ _deferring = False
 
 
 def install() -> None:
-    """Take Ctrl-C and the system's request to end, which is treated alike."""
-    signal.signal(signal.SIGINT, _on_signal)
-    signal.signal(signal.SIGTERM, _on_signal)
+    """Take Ctrl-C; the system's request to end and a closed terminal are treated alike."""
+    for number in SIGNALS:
+        # What `nohup` has made deaf to its terminal's end stays so.
+        if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _on_signal)
     import socket  # it takes its time: Ctrl-C is taken already
 
     told, tells = socket.socketpair()
@@ -89,10 +97,10 @@ def _watch(receive: Callable[[int], bytes]) -> None:
 
     The system tells a socket of a signal at once, `_on_signal` only when Python is running again.
     """
-    while receive(1)[0] not in (signal.SIGINT, signal.SIGTERM):
+    while receive(1)[0] not in SIGNALS:
         pass
     time.sleep(_patience_s)
-    os._exit(EXIT_CODE)
+    os._exit(INTERRUPTED)
 
 
 def _on_signal(number: int, frame: object) -> None:

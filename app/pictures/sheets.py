@@ -125,10 +125,12 @@ def write_picture(path: Path, figure: Figure, dpi: int = DPI) -> None:
     """
     kind = path.suffix.lower().removeprefix(".")
     drawn = io.BytesIO()
-    encoding = {"quality": _WEBP_QUALITY} if kind == "webp" else None
+    more: dict[str, Any] = {}
+    if kind == "webp":
+        more = {"pil_kwargs": {"quality": _WEBP_QUALITY}}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a letter of some source's name that no font has
-        figure.savefig(drawn, format=kind, dpi=dpi, pil_kwargs=encoding)
+        figure.savefig(drawn, format=kind, dpi=dpi, **more)
     write_output(path, drawn.getvalue())
 
 

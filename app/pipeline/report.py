@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
+from selective_depth.app import __version__
 from selective_depth.app.console.output import write_output
+from selective_depth.app.console.settings_file import to_toml
 from selective_depth.app.pipeline.result import FrameResult
 from selective_depth.app.pipeline.timing import StageSummary
-from selective_depth.app.settings import Settings, to_toml
+from selective_depth.app.settings import Settings
 
 HEADING = "Settings of a run of selective-depth"
 
@@ -144,6 +145,5 @@ def save_settings(path: Path, settings: Settings, source: str) -> None:
         If the file cannot be written.
     """
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    heading = f"{HEADING} {version('selective-depth')}, {made}."
-    text = to_toml(settings, f"{heading}\nsource: {source}".replace("\r", " "))
-    write_output(path, text)
+    heading = f"{HEADING} {__version__}, {made}."
+    write_output(path, to_toml(settings, heading, f"source: {source}"))

@@ -1,0 +1,122 @@
+"""From a command line to its exit code: which command, how loud, and any error as one sentence."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from selective_depth.app.console import interrupt
+from selective_depth.app.console.command import (
+    PROGRAM,
+    Example,
+    completion,
+    find,
+    overview,
+    parse,
+    parse_with_settings,
+)
+from selective_depth.app.console.errors import AppError, UsageError
+from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, MISUSED, OK
+
+NARROWEST = 40
+"""Columns; in fewer, the parser's help can take for ever to find its line breaks."""
+
+
+def run(arguments: Sequence[str], examples: Sequence[Example]) -> int:
+    """Run a command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        What was typed after the program's name.
+    examples : sequence of (str, str)
+        Shown first in the program's own help.
+
+    Returns
+    -------
+    int
+        The exit code, out of `exit_codes`.
+    """
+    words = list(arguments)
+    debug = _take(words, "--debug")
+    verbose = _take(words, "-v", "--verbose")
+    try:
+        with interrupt.recognised():
+            return _dispatch(words, verbose, examples)
+    except BrokenPipeError:  # whoever read the output has seen enough, as in `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except KeyboardInterrupt:
+        _say("interrupted.")
+        return INTERRUPTED
+    except Exception as error:  # the one place where any error becomes one line
+        if debug:
+            raise
+        _say(_sentence(error))
+        return MISUSED if isinstance(error, UsageError) else FAILED
+
+
+def _dispatch(words: list[str], verbose: bool, examples: Sequence[Example]) -> int:
+    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(message)s")
+    # The viewer's SDK logs in its own way to the terminal; its warnings are told in ours.
+    os.environ.setdefault("RUST_LOG", "warn" if verbose else "off")
+    if shutil.get_terminal_size().columns < NARROWEST:
+        os.environ["COLUMNS"] = str(NARROWEST)
+    first, typed = (words or ["--help"])[0], words[1:]
+    if first in ("-h", "--help", "help"):
+        print(overview(examples))
+    elif first == "--version":
+        print(_versions())
+    elif first == "--completion":
+        print(completion(typed[0] if typed else ""))
+    elif "--settings" not in typed:
+        return parse(find(first), typed)() or OK
+    else:
+        at = typed.index("--settings")
+        if at + 1 == len(typed):
+            raise UsageError("--settings needs a file: --settings FILE.toml")
+        file = Path(typed[at + 1])
+        del typed[at : at + 2]
+        return parse_with_settings(find(first), typed, file)() or OK
+    return OK
+
+
+def _take(words: list[str], *names: str) -> bool:
+    found = [word for word in words if word in names]
+    for word in found:
+        words.remove(word)
+    return bool(found)
+
+
+def _versions() -> str:
+    from selective_depth.app import __version__
+    from selective_depth.drivers.errors import SourceError
+    from selective_depth.drivers.openni import runtime_version
+
+    try:
+        runtime = f"OpenNI2 runtime {runtime_version()}"
+    except SourceError as error:
+        runtime = f"no OpenNI2 runtime: {error}"
+    return f"{PROGRAM} {__version__}\n{runtime}"
+
+
+def _sentence(error: Exception) -> str:
+    from selective_depth.drivers.errors import SourceError
+
+    words = " ".join(str(error).split())
+    if isinstance(error, (AppError, SourceError, ValueError, OSError)) and words:
+        return words
+    return (
+        f"unexpected {type(error).__name__}: {words or 'no message'}."
+        " Run it again with --debug to see where, and please report it."
+    )
+
+
+def _say(words: str) -> None:
+    with suppress(OSError):  # the terminal may be closed
+        print(f"{PROGRAM}: {words}", file=sys.stderr)
