@@ -229,7 +229,7 @@ class RemotePlace(Place):
         if self._recording is None and time.monotonic() - self._checked_s > CHECK_EVERY_S:
             self._checked_s = time.monotonic()
             if self._is_back():
-                self.open()
+                self._recording = self._connect()
         if self._recording is None:
             self.missed += isinstance(item, FrameResult)
             return

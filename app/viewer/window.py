@@ -220,7 +220,7 @@ def _start(port: int, options: ViewerOptions) -> bool:
                 stderr=complaints,
                 start_new_session=True,
                 creationflags=getattr(subprocess, "DETACHED_PROCESS", 0),
-                env={"RUST_LOG": "error"} | os.environ,
+                env={"RUST_LOG": "error", "RERUN_APP_ONLY": "true"} | os.environ,
             )
         except OSError as error:
             raise ViewerError(

@@ -105,8 +105,12 @@ def one_screen() -> Iterator[Screen]:
 
 
 @pytest.fixture
-def screen(one_screen: Screen, monkeypatch: pytest.MonkeyPatch) -> Iterator[Screen]:
+def screen(
+    one_screen: Screen, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Screen]:
     """A screen without a window, which this process and what it starts has."""
+    # The viewer remembers its window's size: the user's own is none of ours.
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path_factory.mktemp("remembered")))
     monkeypatch.setenv("DISPLAY", one_screen.name)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     yield one_screen
@@ -264,6 +268,26 @@ def test_a_viewer_killed_at_its_birth_is_named(
     monkeypatch.setattr(window, "viewer_executable", lambda: "/nonexistent/rerun")
     with pytest.raises(ViewerError, match="does not start: '/nonexistent/rerun': No such file"):
         window.get_window(ViewerOptions())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("listening", [False, True])
+def test_a_viewer_that_is_slow_to_open_does_not_hold_up_the_run(
+    screen: Screen, tmp_path: Path, listening: bool
+) -> None:
+    def stop() -> None:
+        until(lambda: screen.viewers)
+        ((port, pid),) = screen.viewers.items()
+        until(lambda: not listening or window.listens(("127.0.0.1", port)))
+        os.kill(pid, signal.SIGSTOP)
+
+    stopper = threading.Thread(target=stop)
+    stopper.start()
+    output = run("replay", SCENE.format(3), cwd=tmp_path)
+    stopper.join()
+    assert re.search("does not answer within 5 s|has not opened within 5 s", output), output
+    assert (tmp_path / "out" / "replay.rrd").stat().st_size > 10_000
+    assert bool(screen.viewers) == ("has not opened" in output)
 
 
 def first_free_ports(count: int) -> list[int]:
