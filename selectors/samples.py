@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -112,6 +113,7 @@ class Samples:
         self.low_mm = np.full(tiles, np.inf, np.float32)
         self.high_mm = np.zeros(tiles, np.float32)
         self.additions = 0
+        self._added: list[tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]] = []
         self.changed = np.zeros(tiles, np.int64)
 
     @classmethod
@@ -144,10 +146,17 @@ class Samples:
         """
         pixels, mm = sample_pairs(uv, depth_mm, self.frame_shape)
         self.additions += 1
+        self._added.append((pixels, mm))
         _record(
             pixels, mm, self.image_mm, self.bits, self.low_mm, self.high_mm, self.changed,
             self.additions, self.tile_px,
         )  # fmt: skip
+
+    def added_since(
+        self, addition: int
+    ) -> Iterator[tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]]:
+        """Pixels and depths (0 = no return) of every addition after one of that number."""
+        return iter(self._added[addition:])
 
     @property
     def seeds(self) -> SeedGrid:

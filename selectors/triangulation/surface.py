@@ -24,12 +24,17 @@ STEP_MM = 50.0
 BRIDGE_PX = 10.0
 """Edge length above which such a triangle does, pixels."""
 
+TILE_PX = 16
+"""Side of the square tiles in which changes are booked."""
+
 Float32Array = npt.NDArray[np.float32]
 Int32Array = npt.NDArray[np.int32]
 
 
 class Layers(NamedTuple):
     """What is known at every pixel, arrays of shape (height, width).
+
+    `touched` alone has a value for every tile of `TILE_PX` pixels a side.
 
     Attributes
     ----------
@@ -46,6 +51,8 @@ class Layers(NamedTuple):
         the nearest sample.
     spread_mm2 : float32 array
         Variance of the depths at the corners of the pixel's triangle; 0 outside the hull.
+    touched : bool array of shape (rows, columns)
+        Tiles in which, or beside which, a pixel may have changed since the reader cleared it.
     """
 
     samples_mm: Float32Array
@@ -54,6 +61,17 @@ class Layers(NamedTuple):
     depth_mm: Float32Array
     plain: npt.NDArray[np.bool_]
     spread_mm2: Float32Array
+    touched: npt.NDArray[np.bool_]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _touch(touched: npt.NDArray[np.bool_], top: int, left: int, bottom: int, right: int) -> None:
+    """Book a change of pixels in these rows and columns, which their neighbours may heed."""
+    rows, columns = touched.shape
+    first_column, last_column = max(left - 1, 0) // TILE_PX, (right + 1) // TILE_PX
+    for row in range(max(top - 1, 0) // TILE_PX, min((bottom + 1) // TILE_PX, rows - 1) + 1):
+        for column in range(first_column, min(last_column, columns - 1) + 1):
+            touched[row, column] = True
 
 
 @njit(cache=True, nogil=True)
@@ -94,6 +112,7 @@ def _claim(layers: Layers, uv: Int32Array) -> None:
                     layers.nearest[v, u] = name
                     if not layers.plain[v, u]:
                         layers.depth_mm[v, u] = z
+                _touch(layers.touched, v, first, v, last)
                 left, right = first, last
                 v += direction
 
@@ -148,8 +167,15 @@ def _draw(
             du, dv = uv[end, 0] - uv[begin, 0], uv[end, 1] - uv[begin, 1]
             owned[k] = hull or dv > 0 or (dv == 0 and du > 0)
         area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)  # positive: they run anticlockwise
-        for v in range(min(v0, v1, v2), max(v0, v1, v2) + 1):
-            for u in range(min(u0, u1, u2), max(u0, u1, u2) + 1):
+        left, right, top, bottom = (
+            min(u0, u1, u2),
+            max(u0, u1, u2),
+            min(v0, v1, v2),
+            max(v0, v1, v2),
+        )
+        _touch(layers.touched, top, left, bottom, right)
+        for v in range(top, bottom + 1):
+            for u in range(left, right + 1):
                 w1 = (u - u0) * (v2 - v0) - (u2 - u0) * (v - v0)
                 w2 = (u1 - u0) * (v - v0) - (u - u0) * (v1 - v0)
                 w0 = area - w1 - w2
@@ -197,6 +223,7 @@ class Surface:
             depth_mm=np.zeros(shape, np.float32),
             plain=np.zeros(shape, np.bool_),
             spread_mm2=np.zeros(shape, np.float32),
+            touched=np.ones(tuple(-(-pixels // TILE_PX) for pixels in shape), np.bool_),
         )
         self._uv = np.empty((0, 2), np.int32)
         self._depth_mm = np.empty(0, np.float32)
@@ -221,6 +248,7 @@ class Surface:
                 layers.samples_mm > 0, self._threads
             )
             layers.depth_mm[:] = layers.samples_mm.ravel()[layers.nearest]
+            layers.touched[:] = True
         else:
             _claim(layers, uv)
         if self._mesh is None:

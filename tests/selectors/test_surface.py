@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from selective_depth.selectors.triangulation import BRIDGE_PX, STEP_MM, Surface
+from selective_depth.selectors.triangulation import BRIDGE_PX, STEP_MM, TILE_PX, Surface
 
 Case = tuple[tuple[int, int], npt.NDArray[np.int32], npt.NDArray[np.float32], list[int]]
 
@@ -88,6 +88,23 @@ def test_the_spread_is_the_variance_of_a_triangle_s_corners(case: Case) -> None:
         variances += corners.astype(float).var(axis=1).tolist()
     nearest = np.abs(np.array(variances)[:, None] - spread.ravel().astype(float)).min(axis=0)
     assert (nearest <= 1e-3 * (1 + spread.ravel())).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(batches())
+def test_what_changes_is_booked_with_its_neighbours(case: Case) -> None:
+    shape, uv, depth_mm, cuts = case
+    surface = Surface(shape)
+    for part in np.split(np.arange(len(uv)), cuts):
+        before = [layer.copy() for layer in surface.layers[:-1]]
+        surface.layers.touched[:] = False
+        surface.add(uv[part], depth_mm[part])
+        pairs = zip(before, surface.layers[:-1], strict=True)
+        changed = np.logical_or.reduce([old != new for old, new in pairs])
+        for v, u in np.argwhere(changed):
+            rows = np.clip([v - 1, v, v + 1], 0, shape[0] - 1) // TILE_PX
+            columns = np.clip([u - 1, u, u + 1], 0, shape[1] - 1) // TILE_PX
+            assert surface.layers.touched[np.ix_(rows, columns)].all()
 
 
 def test_a_batch_far_from_all_others_and_one_of_misses_change_what_they_must() -> None:
