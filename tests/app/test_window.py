@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -318,6 +319,26 @@ def test_others_on_the_ports_are_left_alone(screen: Screen) -> None:
         (third, "a program that does not answer"),
     ):
         assert f"Port {taken} has {whose}; the viewer window listens on {port}." in said
+
+
+def test_two_runs_that_begin_together_share_a_window(screen: Screen) -> None:
+    with ThreadPoolExecutor(2) as both:
+        opened = list(both.map(window.get_window, [ViewerOptions()] * 2))
+    until(lambda: len(screen.viewers) == 1)
+    (port,) = screen.viewers
+    assert [each.url for each in opened] == [window.local_url(port)] * 2
+
+
+@pytest.mark.slow
+def test_a_window_that_hangs_holds_up_nobody(screen: Screen, tmp_path: Path) -> None:
+    window.get_window(ViewerOptions())
+    ((_, pid),) = screen.viewers.items()
+    os.kill(pid, signal.SIGSTOP)
+    start_s = time.monotonic()
+    output = run("replay", SCENE.format(60), "--realtime", cwd=tmp_path)
+    assert "the viewer window had stalled and was left behind" in output
+    assert time.monotonic() - start_s < 25
+    assert list(screen.viewers.values()) == [pid]
 
 
 def test_a_viewer_of_another_version_or_on_another_screen_is_not_taken(
