@@ -32,6 +32,8 @@ PROBE_S = 0.3
 and lose what is logged."""
 ASK_S = 3.0
 """How long a viewer may take to say what it is; it answers between two of its pictures."""
+ASK_OURS_S = 0.5
+"""The same for our own program: its servers, which are to be told apart, answer at once."""
 BIRTH_S = 5.0
 """How long a window may take to open before the run goes on."""
 TRIES = 3
@@ -186,16 +188,16 @@ def get_window(options: ViewerOptions, taken: Container[int] = ()) -> Window:
 
 def look_at(port: int) -> Listener | None:
     """What is on a port of this machine; a viewer on another screen, or not ours, fits nobody."""
-    listener = ask(local_url(port)) if listens(("127.0.0.1", port)) else None
-    if listener is None or not (listener.viewer or listener.silent):
+    if not listens(("127.0.0.1", port)):
+        return None
+    owner, program = owner_of(port), viewer_executable()
+    ours = owner.same_screen and program is not None and owner.program == Path(program).resolve()
+    listener = ask(local_url(port), ASK_OURS_S if ours else ASK_S)
+    if listener is None or (listener.viewer and owner.same_screen):
         return listener
-    owner, ours = owner_of(port), viewer_executable()
-    if not owner.same_screen:
-        where = " on another screen" * listener.viewer
-        return replace(listener, name=f"{listener.name}{where}", fits=False)
-    # A viewer that paints for seconds does not answer; that it is of our version shows its file.
-    busy = ours is not None and owner.program == Path(ours).resolve()
-    return replace(listener, fits=listener.fits or (listener.silent and busy))
+    if listener.viewer:
+        return replace(listener, name=f"{listener.name} on another screen", fits=False)
+    return replace(listener, fits=ours and listener.silent)
 
 
 def _start(port: int, options: ViewerOptions) -> bool | None:
