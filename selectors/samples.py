@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -10,8 +11,8 @@ from numba import njit
 
 from selective_depth.drivers.frame import Camera
 from selective_depth.selectors.arrays import sample_pairs
-from selective_depth.selectors.reconstruct import nearest_sample
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.triangulation import FAR_SQ, nearest_sample
 
 MISSED = np.float32(-1)
 """In an image of samples: measured, but nothing returned."""
@@ -112,6 +113,7 @@ class Samples:
         self.low_mm = np.full(tiles, np.inf, np.float32)
         self.high_mm = np.zeros(tiles, np.float32)
         self.additions = 0
+        self._added: list[tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]] = []
         self.changed = np.zeros(tiles, np.int64)
 
     @classmethod
@@ -144,10 +146,17 @@ class Samples:
         """
         pixels, mm = sample_pairs(uv, depth_mm, self.frame_shape)
         self.additions += 1
+        self._added.append((pixels, mm))
         _record(
             pixels, mm, self.image_mm, self.bits, self.low_mm, self.high_mm, self.changed,
             self.additions, self.tile_px,
         )  # fmt: skip
+
+    def added_since(
+        self, addition: int
+    ) -> Iterator[tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]]:
+        """Pixels and depths (0 = no return) of every addition after one of that number."""
+        return iter(self._added[addition:])
 
     @property
     def seeds(self) -> SeedGrid:
@@ -180,12 +189,9 @@ class Samples:
 
     def gap_px(self) -> npt.NDArray[np.float32]:
         """Distance of every pixel to the nearest return, (H, W); infinite if there is none."""
-        nearest = nearest_sample(self.image_mm > 0)
-        rows, columns = np.indices(self.frame_shape, np.int32)
-        gap: npt.NDArray[np.float32] = np.hypot(
-            nearest[..., 0] - columns, nearest[..., 1] - rows, dtype=np.float32
-        )
-        gap[nearest[..., 0] < 0] = np.inf
+        _, gap_sq = nearest_sample(self.image_mm > 0)
+        gap = np.sqrt(gap_sq, dtype=np.float32)
+        gap[gap_sq == FAR_SQ] = np.inf
         return gap
 
     def open(self) -> npt.NDArray[np.bool_]:

@@ -2,5 +2,6 @@
 
 from selective_depth.selectors.acquire.loop import MOST_ROUNDS, Acquisition, acquire, shots_of
 from selective_depth.selectors.acquire.step import StepSelector
+from selective_depth.selectors.acquire.surface import SurfaceSelector
 
-__all__ = ["MOST_ROUNDS", "Acquisition", "StepSelector", "acquire", "shots_of"]
+__all__ = ["MOST_ROUNDS", "Acquisition", "StepSelector", "SurfaceSelector", "acquire", "shots_of"]

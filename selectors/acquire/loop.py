@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.selectors.acquire.refinement import finer_lattice
-from selective_depth.selectors.acquire.step import StepSelector
+from selective_depth.selectors.acquire.surface import SurfacePlan, SurfaceSelector
 from selective_depth.selectors.arrays import pixels_in
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.samples import Samples
@@ -52,6 +52,8 @@ class Acquisition:
         Height and width of the frame in pixels.
     rounds : tuple of Round
         Summary of each round after the seeds.
+    plan : SurfacePlan or None
+        What chose the shots, where that has made the model on its way.
     """
 
     uv: npt.NDArray[np.int32]
@@ -59,6 +61,7 @@ class Acquisition:
     round: npt.NDArray[np.uint8]
     frame_shape: tuple[int, int]
     rounds: tuple[Round, ...]
+    plan: SurfacePlan | None = None
 
     @property
     def returned(self) -> npt.NDArray[np.bool_]:
@@ -80,6 +83,8 @@ class Acquisition:
 
     def reconstruct(self, threads: int | None = None) -> npt.NDArray[np.float32]:
         """Dense depth of the model in millimetres, shape (H, W)."""
+        if self.plan is not None:
+            return self.plan.model_mm()
         return reconstruct(self.uv, self.depth_mm, self.frame_shape, threads=threads)
 
 
@@ -143,7 +148,7 @@ def acquire(
         apart, the first of several rounds makes their lattice finer (`finer_lattice`).
     selector : Selector or callable, optional
         What a shot is worth, from the samples so far: any selector, or a function of one's own
-        (see `plan_of`); default `StepSelector`.
+        (see `plan_of`); default `SurfaceSelector`.
     shots : int, optional
         The budget as a number of measurements.
     threads : int, optional
@@ -170,7 +175,7 @@ def acquire(
         raise ValueError(f"shots is {shots}; give between 0 and the number of the frame's pixels")
     even_uv, pitch_px = finer_lattice(seeds, total if rounds > 1 else 0)
     samples = Samples.of(seeds, pitch_px)
-    plan = plan_of(selector or StepSelector(threads=threads), samples, threads)
+    plan = plan_of(selector or SurfaceSelector(threads=threads), samples, threads)
     lattice_mm = seeds.depth_mm.ravel()
     uv, depth = [seeds.lattice_uv.reshape(-1, 2)], [lattice_mm]
     whole = _fits_16_bits(lattice_mm) and bool((lattice_mm % 1 == 0).all())
@@ -194,6 +199,7 @@ def acquire(
         np.repeat(np.arange(len(uv), dtype=np.uint8), counts),
         seeds.frame_shape,
         tuple(made),
+        plan if isinstance(plan, SurfacePlan) else None,
     )
 
 

@@ -9,14 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from selective_depth.selectors.reconstruct import (
-    BRIDGE_PX,
-    STEP_MM,
-    nearest_sample,
-    reconstruct,
-)
+from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.triangulation import BRIDGE_PX, STEP_MM, nearest_sample
 from selective_depth.selectors.triangulation.delaunay import GHOST, Mesh
+from selective_depth.selectors.triangulation.nearest import FAR_SQ
 
 Pixels = npt.NDArray[np.int32]
 
@@ -112,16 +109,19 @@ def test_nearest_sample_is_exact(case: tuple[tuple[int, int], Pixels]) -> None:
     shape, uv = case
     valid = np.zeros(shape, np.bool_)
     valid[uv[:, 1], uv[:, 0]] = True
-    found = nearest_sample(valid)
-    assert valid[found[..., 1], found[..., 0]].all()
+    nearest, gap_sq = nearest_sample(valid)
+    assert valid.ravel()[nearest].all()
     rows, columns = np.indices(shape)
-    distance = (found[..., 0] - columns) ** 2 + (found[..., 1] - rows) ** 2
+    distance = (nearest % shape[1] - columns) ** 2 + (nearest // shape[1] - rows) ** 2
     np.testing.assert_array_equal(distance, nearest_reference(valid))
-    np.testing.assert_array_equal(found, nearest_sample(valid, threads=1))
+    np.testing.assert_array_equal(gap_sq, distance)
+    np.testing.assert_array_equal(nearest, nearest_sample(valid, threads=1)[0])
 
 
 def test_nearest_sample_of_nothing_says_so() -> None:
-    assert (nearest_sample(np.zeros((3, 4), np.bool_)) == -1).all()
+    nearest, gap_sq = nearest_sample(np.zeros((3, 4), np.bool_))
+    assert (nearest == -1).all()
+    assert (gap_sq == FAR_SQ).all()
 
 
 def candidates(
