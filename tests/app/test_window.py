@@ -25,8 +25,9 @@ from rerun.experimental import ViewerClient
 from rerun_listener import Listener
 
 from selective_depth.app.console.errors import ViewerError
+from selective_depth.app.pipeline import StageTimes
 from selective_depth.app.settings import ViewerOptions
-from selective_depth.app.viewer import window
+from selective_depth.app.viewer import Viewer, window
 from selective_depth.app.viewer.owner import owner_of
 
 pytestmark = pytest.mark.skipif(
@@ -37,12 +38,12 @@ pytestmark = pytest.mark.skipif(
 )
 QUICK = ("--seeds.rows", "24", "--seeds.columns", "32", "--gas.nodes", "60")
 SCENE = "virtual:ball?size=160x120&frames={}"
-DRIVERLESS = {
-    "VK_ICD_FILENAMES": "/nonexistent",
-    "VK_DRIVER_FILES": "/nonexistent",
-    "LIBGL_DRIVERS_PATH": "/nonexistent",
-    "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent",
-}
+DRIVER_SETTINGS = (
+    "VK_ICD_FILENAMES",
+    "VK_DRIVER_FILES",
+    "LIBGL_DRIVERS_PATH",
+    "__EGL_VENDOR_LIBRARY_FILENAMES",
+)
 
 
 class Screen:
@@ -235,7 +236,9 @@ def free_port() -> int:
         return int(free.getsockname()[1])
 
 
-def test_without_a_window_the_run_goes_on_to_a_file(screen: Screen, tmp_path: Path) -> None:
+def test_without_a_window_the_run_goes_on_to_a_file(
+    screen: Screen, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = SCENE.format(3)
     start_s = time.monotonic()
     output = run("replay", scene, cwd=tmp_path, DISPLAY=":4321")
@@ -245,11 +248,15 @@ def test_without_a_window_the_run_goes_on_to_a_file(screen: Screen, tmp_path: Pa
     assert "Saving to out/replay.rrd" in line
     assert {each.suffix for each in (tmp_path / "out").iterdir()} == {".rrd", ".toml", ".png"}
 
-    saved = tmp_path / "asked.rrd"
-    output = run("replay", scene, "--save", str(saved), cwd=tmp_path, **DRIVERLESS)
-    assert "The viewer window does not start: " in output
-    assert saved.stat().st_size > 10_000
-    assert saved.with_suffix(".png").exists()
+    with monkeypatch.context() as driverless:
+        for name in DRIVER_SETTINGS:
+            driverless.setenv(name, "/nonexistent")
+        asked = ViewerOptions(save=tmp_path / "asked.rrd")
+        shown = Viewer(asked, live=False, times=StageTimes(), fallback=tmp_path / "not.rrd")
+        assert shown.options == asked
+        assert any("The viewer window does not start: " in said for said in shown.news())
+        assert list(shown.dropped) == [f"file '{asked.save}'"]
+        assert shown.close() == []
     assert not screen.viewers
 
 
@@ -385,8 +392,10 @@ def test_connecting_opens_no_window(screen: Screen, tmp_path: Path) -> None:
     (port,) = screen.viewers
     assert list(frames_in(port).values()) == [(0, 4)]
     with Listener() as elsewhere:
-        assert elsewhere.options.connect is not None
-        run("replay", SCENE.format(2), "--connect", elsewhere.options.connect, cwd=tmp_path)
+        options = dataclasses.replace(elsewhere.options, headless=False)
+        shown = Viewer(options, live=False, times=StageTimes())
+        assert list(shown.dropped) == [f"viewer at {options.connect}"]
+        assert shown.close() == []
     assert screen.windows == 1
     assert list(screen.viewers) == [port]
 
