@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.selectors.acquire.refinement import finer_lattice
+from selective_depth.selectors.acquire.step import StepSelector
 from selective_depth.selectors.acquire.surface import SurfacePlan, SurfaceSelector
 from selective_depth.selectors.arrays import pixels_in
 from selective_depth.selectors.reconstruct import reconstruct
@@ -120,6 +121,15 @@ def _fits_16_bits(depth_mm: npt.NDArray[np.float32]) -> bool:
     return bool(depth_mm.max(initial=0) <= np.iinfo(np.uint16).max)
 
 
+def best_selector(rounds: int, threads: int | None = None) -> Selector:
+    """The selector that `acquire` takes by default: the best there is for so many rounds.
+
+    In one round there is no model yet that knows where the steps are, only the seeds': there the
+    step score is better, which weighs more samples than a triangle has.
+    """
+    return StepSelector(threads=threads) if rounds == 1 else SurfaceSelector(threads=threads)
+
+
 def acquire(
     measure: Measure,
     seeds: SeedGrid,
@@ -148,7 +158,7 @@ def acquire(
         apart, the first of several rounds makes their lattice finer (`finer_lattice`).
     selector : Selector or callable, optional
         What a shot is worth, from the samples so far: any selector, or a function of one's own
-        (see `plan_of`); default `SurfaceSelector`.
+        (see `plan_of`); default `best_selector`.
     shots : int, optional
         The budget as a number of measurements.
     threads : int, optional
@@ -175,7 +185,7 @@ def acquire(
         raise ValueError(f"shots is {shots}; give between 0 and the number of the frame's pixels")
     even_uv, pitch_px = finer_lattice(seeds, total if rounds > 1 else 0)
     samples = Samples.of(seeds, pitch_px)
-    plan = plan_of(selector or SurfaceSelector(threads=threads), samples, threads)
+    plan = plan_of(selector or best_selector(rounds, threads), samples, threads)
     lattice_mm = seeds.depth_mm.ravel()
     uv, depth = [seeds.lattice_uv.reshape(-1, 2)], [lattice_mm]
     whole = _fits_16_bits(lattice_mm) and bool((lattice_mm % 1 == 0).all())

@@ -1,16 +1,16 @@
 """Where the kept model is likely to be wrong: the default score of unmeasured pixels.
 
-A model that is linear between samples errs where a depth step runs through a triangle: by about
-the height of the step, over about as much of the image as lies nearer to the pixel than to any
-sample. Both can be read off the model itself. Its slope times the distance to the nearest sample
-is how far the depth goes from there to the pixel; the spread of the corners of the pixel's triangle
-is what there is to go. Their mean, weighted by how likely a shot is to return, is the score. It
+A model that is linear between samples errs where a depth step runs through a triangle, and how much
+can be read off the model itself: its slope times the distance to the nearest sample is how far the
+depth goes from there to the pixel, and the spread of the corners of the pixel's triangle is what
+there is to go. A shot beside one that missed is likely to miss. Their product is the score. It
 needs nothing but the model of the samples so far, which is kept while they come: a round costs what
 it adds, and after the last one the model is there.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,28 +22,36 @@ from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.selection import Selection
-from selective_depth.selectors.triangulation import TILE_PX, Layers, Surface
+from selective_depth.selectors.triangulation import FAR_SQ, TILE_PX, Layers, Surface
 
 Float32Array = npt.NDArray[np.float32]
-Counts = npt.NDArray[np.int16]
 
 _FLAT = np.float32(1e-3)
 """Slope where the model has none, mm per pixel: what is left of a budget spreads by it."""
 
 
 @njit(cache=True, nogil=True)
-def _count(
-    uv: npt.NDArray[np.int32], depth_mm: Float32Array, radius: int, returns: Counts, misses: Counts
+def _note_misses(
+    uv: npt.NDArray[np.int32],
+    depth_mm: Float32Array,
+    radius: int,
+    miss_sq: npt.NDArray[np.int32],
+    touched: npt.NDArray[np.bool_],
 ) -> None:
-    """Add shots to the numbers of returns and misses in the square window about every pixel."""
-    height, width = returns.shape
+    """Lower the squared distance to the nearest miss within a radius of each, and book it."""
+    height, width = miss_sq.shape
     for i in range(len(uv)):
-        counts = returns if depth_mm[i] > 0 else misses
-        top, bottom = max(uv[i, 1] - radius, 0), min(uv[i, 1] + radius + 1, height)
-        left, right = max(uv[i, 0] - radius, 0), min(uv[i, 0] + radius + 1, width)
-        for v in range(top, bottom):
-            for u in range(left, right):
-                counts[v, u] += 1
+        if depth_mm[i] > 0:
+            continue
+        u0, v0 = uv[i, 0], uv[i, 1]
+        top, bottom = max(v0 - radius, 0), min(v0 + radius, height - 1)
+        left, right = max(u0 - radius, 0), min(u0 + radius, width - 1)
+        for v in range(top, bottom + 1):
+            for u in range(left, right + 1):
+                miss_sq[v, u] = min(miss_sq[v, u], (u - u0) ** 2 + (v - v0) ** 2)
+        touched[top // TILE_PX : bottom // TILE_PX + 1, left // TILE_PX : right // TILE_PX + 1] = (
+            True
+        )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -51,8 +59,7 @@ def _score_tiles(
     tiles: npt.NDArray[np.int64],
     layers: Layers,
     image_mm: Float32Array,
-    returns: Counts,
-    misses: Counts,
+    miss_sq: npt.NDArray[np.int32],
     reach_sq: float,
     noise_mm2: float,
     score: Float32Array,
@@ -76,31 +83,30 @@ def _score_tiles(
                 slope = max(np.sqrt(along * along + down * down), _FLAT)
                 rise_mm = slope * np.sqrt(np.float32(gap_sq))
                 spread_mm = np.sqrt(layers.spread_mm2[v, u] + np.float32(noise_mm2))
-                share = np.float32(returns[v, u]) / np.float32(returns[v, u] + misses[v, u])
-                score[v, u] = rise_mm * np.sqrt(spread_mm * share)
+                nearness = np.float32(gap_sq) / np.float32(miss_sq[v, u])
+                returning = np.float32(1) / (np.float32(1) + nearness * nearness)
+                score[v, u] = rise_mm * np.sqrt(spread_mm) * returning
 
 
 @dataclass(frozen=True)
 class SurfaceSelector:
-    """Expected error of the kept model: ``rise * sqrt(spread * P(return))``.
+    """Expected error of the kept model: ``rise * sqrt(spread) * P(return)``.
 
     `rise` is the slope of the model (central differences) times the distance to the nearest return;
     `spread` the standard deviation of the depths at the corners of the pixel's triangle, and noise;
-    ``P(return)`` the share of the shots around that returned depth. Chosen on the `livingroom` and
-    `tabletop` frames and the virtual scenes; figures in ``app/docs/evaluation.md``.
+    ``P(return) = 1 / (1 + (g / m)^4)``, where `g` and `m` are the distances to the nearest return
+    and the nearest miss. The exponents were chosen on the `livingroom` and `tabletop` frames and
+    the virtual scenes; figures in ``app/docs/evaluation.md``.
 
     Parameters
     ----------
     noise_mm : float, default 5
         Error expected even where all neighbours agree.
-    window : float, default 1
-        Half the side of the window of ``P(return)``, in steps of the seed lattice.
     threads : int, optional
         Kernel threads; default `default_threads()`. The result does not depend on it.
     """
 
     noise_mm: float = 5.0
-    window: float = 1.0
     threads: int | None = None
     name = "surface score"
 
@@ -129,18 +135,17 @@ class SurfacePlan:
         self._rule = rule
         self._samples = samples
         self._surface = Surface(shape, rule.threads)
-        self._returns, self._misses = np.zeros(shape, np.int16), np.zeros(shape, np.int16)
+        self._miss_sq = np.full(shape, FAR_SQ, np.int32)
         self._seen = 0
         self.score = np.zeros(shape, np.float32)
 
     def look(self) -> None:
         """Take in what was measured since, and score again what that changes."""
         samples, layers = self._samples, self._surface.layers
-        radius = max(round(self._rule.window * samples.pitch_px), 1)
+        radius = math.ceil(2 * samples.reach_px)
         for uv, depth_mm in samples.added_since(self._seen):
             self._surface.add(uv, depth_mm)
-            _count(uv, depth_mm, radius, self._returns, self._misses)
-            _touch_windows(uv, radius, layers.touched)
+            _note_misses(uv, depth_mm, radius, self._miss_sq, layers.touched)
         self._seen = samples.additions
         tiles = np.flatnonzero(layers.touched)
         layers.touched[:] = False
@@ -150,8 +155,7 @@ class SurfacePlan:
                 tiles[first:end],
                 layers,
                 samples.image_mm,
-                self._returns,
-                self._misses,
+                self._miss_sq,
                 float(samples.reach_px**2),
                 float(self._rule.noise_mm**2),
                 self.score,
@@ -171,16 +175,3 @@ class SurfacePlan:
             self._surface.add(uv, depth_mm)
         self._seen = self._samples.additions
         return self._surface.layers.depth_mm.copy()
-
-
-@njit(cache=True, nogil=True)
-def _touch_windows(uv: npt.NDArray[np.int32], radius: int, touched: npt.NDArray[np.bool_]) -> None:
-    """Book the tiles in which the number of returns or misses has changed."""
-    rows, columns = touched.shape
-    for i in range(len(uv)):
-        top, left = max(uv[i, 1] - radius, 0) // TILE_PX, max(uv[i, 0] - radius, 0) // TILE_PX
-        bottom = min((uv[i, 1] + radius) // TILE_PX, rows - 1)
-        right = min((uv[i, 0] + radius) // TILE_PX, columns - 1)
-        for row in range(top, bottom + 1):
-            for column in range(left, right + 1):
-                touched[row, column] = True
