@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.seeds import SeedGrid
 
 MISSED = np.float32(-1)

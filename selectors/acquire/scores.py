@@ -16,8 +16,8 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.acquire.choice import best_pixels, choose
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import Samples
