@@ -3,7 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 QUICK := not slow and not hardware and not browser
-TEST_PACKAGES := libopenni2-0 libopenni2-dev g++ libvulkan1 mesa-vulkan-drivers
+WINDOW_PACKAGES := libvulkan1 mesa-vulkan-drivers
+TEST_PACKAGES := libopenni2-0 libopenni2-dev g++ $(WINDOW_PACKAGES) xvfb x11-utils
 
 .DEFAULT_GOAL := help
 .PHONY: help typing run test test-slow lint format system-packages recordings pictures wheel wheel-check docs hooks clean
@@ -26,7 +27,7 @@ $(VENV)/.tests-installed: pyproject.toml $(VENV)/.installed
 	@touch $@
 
 run: $(VENV)/.installed ## Replay the bundled recording: a viewer, or files where there is no display
-	@.ci/system-packages libopenni2-0 || echo "Going on without: the recording's PNG twin is replayed instead."
+	@[ -z "$$DISPLAY$$WAYLAND_DISPLAY" ] || .ci/system-packages $(WINDOW_PACKAGES) || echo "Going on without: where there is no graphics driver, the run is saved to a file."
 	@$(BIN)/selective-depth replay --budget 0.05 --rounds 4
 
 test: $(VENV)/.tests-installed ## Run the whole suite (the long forms: make test-slow)
@@ -60,7 +61,7 @@ format: $(VENV)/.tests-installed ## Put the code in its standard form
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
-system-packages: ## Install what Debian has to give: OpenNI2, its headers, a software Vulkan
+system-packages: ## Install what Debian has to give: OpenNI2, its headers, a software Vulkan, an X server for tests
 	@.ci/system-packages $(TEST_PACKAGES)
 
 recordings: $(VENV)/.tests-installed ## Make the recordings in recordings/ again
@@ -68,7 +69,7 @@ recordings: $(VENV)/.tests-installed ## Make the recordings in recordings/ again
 	@$(BIN)/python tests/make_recordings.py
 
 pictures: $(VENV)/.installed ## Make the pictures of the README and the documentation again
-	@.ci/system-packages libopenni2-0 libvulkan1 mesa-vulkan-drivers
+	@.ci/system-packages libopenni2-0 $(WINDOW_PACKAGES)
 	@$(BIN)/selective-depth replay --headless --save out/viewer.rrd --budget 0.05 --rounds 4
 	@$(BIN)/selective-depth screenshot out/viewer.rrd app/docs/pictures/viewer.webp
 	@$(BIN)/selective-depth snapshot virtual:workstation virtual:ball virtual:firehose --out out/stills

@@ -11,6 +11,13 @@ import numpy.typing as npt
 DepthArray = npt.NDArray[np.uint16]
 """Depth image, shape (height, width), millimetres, 0 = no measurement."""
 
+MOST_PX = 1e6
+"""Greatest focal length, and farthest principal point, of any camera: so that no metric point of
+any depth leaves the range of 32-bit floats."""
+LEAST_FOCAL_PX = 1e-2
+MOST_TIME_US = 1 << 62
+"""Timestamps lie within this of 0: about 146,000 years, and their differences fit in 64 bits."""
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -28,7 +35,8 @@ class Camera:
     Raises
     ------
     ValueError
-        If a size or a focal length is not positive, or a value is not finite.
+        If a value is out of its range: sizes from 1, focal lengths from `LEAST_FOCAL_PX` to
+        `MOST_PX`, the principal point within `MOST_PX` of the first pixel.
     """
 
     width: int
@@ -43,12 +51,18 @@ class Camera:
             raise ValueError(
                 f"camera size is {self.width}x{self.height} pixels; both must be at least 1"
             )
-        if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy))):
-            raise ValueError(f"camera intrinsics must be finite numbers, got {self}")
-        if self.fx <= 0 or self.fy <= 0:
-            raise ValueError(
-                f"focal lengths are {self.fx} and {self.fy} pixels; both must be positive"
-            )
+        for name in ("fx", "fy"):
+            if not LEAST_FOCAL_PX <= getattr(self, name) <= MOST_PX:
+                raise ValueError(
+                    f"the focal length {name} is {getattr(self, name)} pixels; it must be from"
+                    f" {LEAST_FOCAL_PX:g} to {MOST_PX:g}"
+                )
+        for name in ("cx", "cy"):
+            if not -MOST_PX <= getattr(self, name) <= MOST_PX:
+                raise ValueError(
+                    f"the principal point's {name} is {getattr(self, name)} pixels; it must be from"
+                    f" {-MOST_PX:g} to {MOST_PX:g}"
+                )
 
     @classmethod
     def from_fov(cls, width: int, height: int, fov_x_rad: float, fov_y_rad: float) -> Camera:
@@ -123,11 +137,13 @@ class DepthFrame:
     Parameters
     ----------
     depth_mm : uint16 array of shape (height, width)
-        Depth along the optical axis in millimetres; 0 = no measurement. Made read-only.
+        Depth along the optical axis in millimetres; 0 = no measurement. The frame keeps a copy, in
+        this machine's byte order, with 0 where the array is masked; it is read-only. Only an array
+        that is read-only and owns its memory is taken as it is, for nobody can change it.
     index : int
         Number of the frame in its source, from 0.
     timestamp_us : int
-        The sensor's clock, microseconds; only differences mean anything.
+        The sensor's clock, microseconds; only differences mean anything. Within `MOST_TIME_US`.
     camera : Camera
         Intrinsics, of the image's size.
     source : str
@@ -136,7 +152,7 @@ class DepthFrame:
     Raises
     ------
     ValueError
-        If the array's type or shape is not as stated, saying what was expected.
+        If the array's type or shape or the timestamp is not as stated, saying what was expected.
     """
 
     depth_mm: DepthArray
@@ -150,19 +166,26 @@ class DepthFrame:
         # Asked of the object: the annotation does not keep a caller from giving a list.
         kind = getattr(depth, "dtype", type(depth).__name__)
         shape = getattr(depth, "shape", ())
-        if kind != np.uint16 or len(shape) != 2:
+        unsigned_16 = isinstance(kind, np.dtype) and kind.kind == "u" and kind.itemsize == 2
+        if not unsigned_16 or len(shape) != 2:
             raise ValueError(
                 f"depth_mm must be a uint16 array of shape (height, width), got {kind} {shape}"
+            )
+        if not -MOST_TIME_US <= self.timestamp_us <= MOST_TIME_US:
+            raise ValueError(
+                f"timestamp_us is {self.timestamp_us}; it must lie within {MOST_TIME_US} of 0"
             )
         if depth.shape != (self.camera.height, self.camera.width):
             raise ValueError(
                 f"depth_mm has shape {depth.shape}, but the camera is {self.camera.height} rows"
                 f" by {self.camera.width} columns"
             )
-        if not depth.flags.c_contiguous:
-            depth = np.ascontiguousarray(depth)
+        handed_over = type(depth) is np.ndarray and depth.base is None and not depth.flags.writeable
+        if not (handed_over and depth.flags.c_contiguous and depth.dtype.isnative):
+            # A sensor fills its buffer again: a frame that is kept stays what it was.
+            depth = np.array(np.ma.filled(depth, 0), np.uint16, order="C")
+            depth.flags.writeable = False
             object.__setattr__(self, "depth_mm", depth)
-        depth.flags.writeable = False
 
     @property
     def shape(self) -> tuple[int, int]:

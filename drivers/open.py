@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from selective_depth.drivers.errors import RuntimeMissingError, SourceNotFoundError
+from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.source import DepthSource
 
 _WHAT_THERE_IS = (
@@ -56,12 +56,8 @@ def open_source(uri: str | Path) -> DepthSource:
         return RecordedFolder(path)
     if suffix == ".oni":
         from selective_depth.drivers.oni import OniReader
-        from selective_depth.drivers.openni import OpenNIRecording
 
-        try:
-            return OpenNIRecording(path)
-        except RuntimeMissingError:
-            return OniReader(path)  # the same frames, without OpenNI2
+        return OniReader(path)
     if not path.exists():
         raise SourceNotFoundError(f"'{name}' does not exist. {_WHAT_THERE_IS}")
     raise SourceNotFoundError(

@@ -29,6 +29,7 @@ class RealtimeSource(DepthSource):
         self.camera = source.camera
         self.fps = source.fps
         self.frame_count = source.frame_count
+        self.notes = source.notes
         self.dropped = 0
         self._changed = threading.Condition()
         self._newest: DepthFrame | None = None
@@ -40,6 +41,7 @@ class RealtimeSource(DepthSource):
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         """Return the newest frame that has not been read; see `DepthSource.read`."""
+        self.check_process()
         with self._changed:
             self._asked_again = self._first_taken
             self._changed.notify_all()

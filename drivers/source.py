@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from types import TracebackType
 from typing import Self
 
-from selective_depth.drivers.errors import SourceEndedError
+from selective_depth.drivers.errors import SourceEndedError, SourceError
 from selective_depth.drivers.frame import Camera, DepthFrame
 
 
@@ -33,6 +34,8 @@ class DepthSource(ABC):
     state : str
         ``"live"``; a sensor that can fail also says ``"stalled"`` (there, but silent),
         ``"lost"`` (not there) or ``"reconnecting"`` (there again, being opened).
+    notes : tuple of str
+        What a user should know of it, a sentence each: what is missing, what was assumed.
     """
 
     uri: str
@@ -42,6 +45,30 @@ class DepthSource(ABC):
     live: bool
     dropped: int
     state: str = "live"
+    notes: tuple[str, ...] = ()
+    _opened_by: int
+
+    def __new__(cls, *_: object, **__: object) -> Self:
+        """Remember which process opens it."""
+        source = super().__new__(cls)
+        source._opened_by = os.getpid()
+        return source
+
+    def check_process(self) -> None:
+        """Refuse to be read in a forked process; sources with a thread, a file or a child call it.
+
+        Threads do not survive a fork, and two processes share the place in a file.
+
+        Raises
+        ------
+        SourceError
+            Saying to open the source where it is read.
+        """
+        if os.getpid() != self._opened_by:
+            raise SourceError(
+                f"'{self.uri}' was opened by another process, from which this one was forked; open"
+                " it in the process that reads it."
+            )
 
     @abstractmethod
     def read(self, timeout_s: float = 5.0) -> DepthFrame:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.drivers.frame import Camera
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import sample_pairs
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.triangulation import FAR_SQ, nearest_sample
 
 MISSED = np.float32(-1)
 """In an image of samples: measured, but nothing returned."""
@@ -28,11 +32,12 @@ def _record(
     bits: npt.NDArray[np.uint64],
     low_mm: npt.NDArray[np.float32],
     high_mm: npt.NDArray[np.float32],
-    stale: npt.NDArray[np.bool_],
+    changed: npt.NDArray[np.int64],
+    number: int,
     tile_px: int,
 ) -> None:
-    tile_rows, tile_columns = stale.shape
-    touched = np.zeros(stale.shape, np.bool_)
+    tile_rows, tile_columns = changed.shape
+    touched = np.zeros(changed.shape, np.bool_)
     for i in range(len(uv)):
         u, v, z = uv[i, 0], uv[i, 1], depth_mm[i]
         bits[v, (u >> 6) + 1] |= np.uint64(1) << np.uint64(u & 63)
@@ -47,7 +52,7 @@ def _record(
     for row in range(tile_rows):
         for column in range(tile_columns):
             if touched[row, column]:
-                stale[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = True
+                changed[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = number
 
 
 def seed_pitch_px(seeds: SeedGrid) -> float:
@@ -56,15 +61,18 @@ def seed_pitch_px(seeds: SeedGrid) -> float:
 
 
 class Samples:
-    """The measurements of one frame: an image of them, and an index over it.
+    """The measurements of one frame so far: an image of them, and an index over it.
 
     Parameters
     ----------
-    shape : tuple of int
+    frame_shape : tuple of int
         Height and width of the frame in pixels.
     pitch_px : float, default 5
         Widest step of the seed lattice, the scale of all distances: 5 for 128x128 seeds on
         640x480.
+    seeds : SeedGrid, optional
+        The lattice that all began with, for the selectors that think in its cells and for metric
+        points; by default one of that pitch on which nothing was measured, of a Kinect.
 
     Attributes
     ----------
@@ -84,40 +92,108 @@ class Samples:
         One bit per measured pixel; a word of zeros on either side spares the borders.
     low_mm, high_mm : float32 arrays of shape (rows, columns)
         Least and greatest depth in each tile; low > high where there is none.
-    stale : bool array of shape (rows, columns)
-        Tiles measured in, or beside one measured in, since the reader last cleared it.
+    additions : int
+        How often measurements were added.
+    changed : int64 array of shape (rows, columns)
+        Number of the last addition to each tile or to one beside it, 0 before the first.
     """
 
-    def __init__(self, shape: tuple[int, int], pitch_px: float = 5.0) -> None:
-        height, width = shape
-        self.shape = shape
+    def __init__(
+        self, frame_shape: tuple[int, int], pitch_px: float = 5.0, seeds: SeedGrid | None = None
+    ) -> None:
+        height, width = self.frame_shape = frame_shape
         self.pitch_px = pitch_px
+        self._seeds = seeds
         self.vote_px = min(math.ceil(1.8 * pitch_px), (_WORD - 1) // 3)
         self.reach_px = min(REACH * pitch_px, self.vote_px)
         self.tile_px = 3 * math.ceil(self.vote_px / 3)
         tiles = -(-height // self.tile_px), -(-width // self.tile_px)
-        self.image_mm = np.zeros(shape, np.float32)
+        self.image_mm = np.zeros(frame_shape, np.float32)
         self.bits = np.zeros((height, (width + _WORD - 1) // _WORD + 2), np.uint64)
         self.low_mm = np.full(tiles, np.inf, np.float32)
         self.high_mm = np.zeros(tiles, np.float32)
-        self.stale = np.ones(tiles, np.bool_)
+        self.additions = 0
+        self._added: list[tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]] = []
+        self.changed = np.zeros(tiles, np.int64)
 
     @classmethod
-    def of(cls, seeds: SeedGrid, pitch_px: float | None = None) -> Samples:
-        """The seeds of a frame as its first samples; the scale is their own step by default."""
-        samples = cls(seeds.frame_shape, pitch_px or seed_pitch_px(seeds))
+    def of(cls, seeds: SeedGrid | Samples, pitch_px: float | None = None) -> Samples:
+        """The seeds of a frame as its first samples, or samples as they are.
+
+        The scale is the seeds' own step by default.
+        """
+        if isinstance(seeds, Samples):
+            return seeds
+        samples = cls(seeds.frame_shape, pitch_px or seed_pitch_px(seeds), seeds)
         samples.add(seeds.lattice_uv.reshape(-1, 2), seeds.depth_mm.ravel())
         return samples
 
-    def add(self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.generic]) -> None:
-        """Book measurements: pixels (n, 2), column first, and depth (n,), 0 = no return."""
+    def add(self, uv: npt.ArrayLike, depth_mm: npt.ArrayLike) -> None:
+        """Book measurements.
+
+        Parameters
+        ----------
+        uv : int array of shape (n, 2)
+            Pixels, column first. Of several at one pixel the last counts.
+        depth_mm : array of shape (n,)
+            Depth in millimetres; what is no depth (see `measured_mm`) was a shot that returned
+            nothing.
+
+        Raises
+        ------
+        ValueError
+            If the shapes do not fit or a pixel lies outside the frame.
+        """
+        pixels, mm = sample_pairs(uv, depth_mm, self.frame_shape)
+        self.additions += 1
+        self._added.append((pixels, mm))
         _record(
-            uv,
-            np.ascontiguousarray(depth_mm, dtype=np.float32),
-            self.image_mm,
-            self.bits,
-            self.low_mm,
-            self.high_mm,
-            self.stale,
-            self.tile_px,
-        )
+            pixels, mm, self.image_mm, self.bits, self.low_mm, self.high_mm, self.changed,
+            self.additions, self.tile_px,
+        )  # fmt: skip
+
+    def added_since(
+        self, addition: int
+    ) -> Iterator[tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]]:
+        """Pixels and depths (0 = no return) of every addition after one of that number."""
+        return iter(self._added[addition:])
+
+    @property
+    def seeds(self) -> SeedGrid:
+        """The lattice that all began with; its depths are in `image_mm` like all others."""
+        if self._seeds is None:
+            lattice = [max(round(pixels / self.pitch_px), 1) for pixels in self.frame_shape]
+            nothing = np.zeros(self.frame_shape, np.uint16)
+            self._seeds = SeedGrid.from_array(nothing, (lattice[0], lattice[1]))
+        return self._seeds
+
+    @property
+    def camera(self) -> Camera | None:
+        """Intrinsics; None for a sensor that is no pinhole."""
+        return self.seeds.camera
+
+    @property
+    def uv(self) -> npt.NDArray[np.int32]:
+        """Pixels (column, row) of the samples that returned depth, shape (n, 2), row by row."""
+        return np.argwhere(self.image_mm > 0)[:, ::-1].astype(np.int32)
+
+    @property
+    def depth_mm(self) -> npt.NDArray[np.float32]:
+        """Their depths, shape (n,)."""
+        return self.image_mm[self.image_mm > 0]
+
+    @property
+    def points_mm(self) -> npt.NDArray[np.float32]:
+        """Their metric points, shape (n, 3)."""
+        return self.seeds.points_at(self.uv, self.depth_mm)
+
+    def gap_px(self) -> npt.NDArray[np.float32]:
+        """Distance of every pixel to the nearest return, (H, W); infinite if there is none."""
+        _, gap_sq = nearest_sample(self.image_mm > 0)
+        gap = np.sqrt(gap_sq, dtype=np.float32)
+        gap[gap_sq == FAR_SQ] = np.inf
+        return gap
+
+    def open(self) -> npt.NDArray[np.bool_]:
+        """Pixels that may be shot, (H, W): not measured yet, and within reach of a return."""
+        return np.asarray((self.image_mm == 0) & (self.gap_px() <= self.reach_px))

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.selectors.arrays import measured_mm, warn_of_metres
+
+Measure = Callable[[npt.NDArray[np.int32]], npt.ArrayLike]
+"""A random-access depth sensor: pixels (n, 2), column first, to depth (n,) in mm, 0 = none."""
 
 
 def cell_centres(pixels: int, cells: int, name: str = "seeds") -> npt.NDArray[np.int32]:
@@ -67,18 +73,18 @@ class SeedGrid:
     @classmethod
     def from_array(
         cls,
-        depth_mm: npt.NDArray[np.generic],
+        depth_mm: npt.ArrayLike,
         shape: tuple[int, int] = (128, 128),
         *,
         camera: Camera | None = None,
-        points_mm: npt.NDArray[np.floating] | None = None,
+        points_mm: npt.ArrayLike | None = None,
     ) -> SeedGrid:
         """Take the seeds of a plain depth or range image, of any sensor.
 
         Parameters
         ----------
         depth_mm : array of shape (height, width)
-            Depth or range in millimetres; 0, negative or not finite = no measurement.
+            Depth or range in millimetres; what is no depth (see `measured_mm`) is no measurement.
         shape : tuple of int, default (128, 128)
             Rows and columns of the lattice.
         camera : Camera, optional
@@ -92,24 +98,71 @@ class SeedGrid:
         ValueError
             If an array's shape is wrong or the lattice does not fit.
         """
-        if depth_mm.ndim != 2:
-            raise ValueError(f"depth_mm must have shape (height, width), got {depth_mm.shape}")
-        height, width = depth_mm.shape
+        if np.ndim(depth_mm) != 2:
+            raise ValueError(f"depth_mm must have shape (height, width), got {np.shape(depth_mm)}")
+        image = np.ma.asanyarray(depth_mm) if np.ma.isMA(depth_mm) else np.asarray(depth_mm)
+        height, width = image.shape
         rows = cell_centres(height, shape[0], "rows of seeds")
         columns = cell_centres(width, shape[1], "columns of seeds")
-        seeds = depth_mm[np.ix_(rows, columns)].astype(np.float32)
-        seeds[~(np.isfinite(seeds) & (seeds > 0))] = 0
+        cells = np.ix_(rows, columns)
+        seeds_mm = measured_mm(image[cells])
         given = None
         if points_mm is not None:
-            if points_mm.shape != (height, width, 3):
+            if np.shape(points_mm) != (height, width, 3):
                 raise ValueError(
-                    f"points_mm must have shape {(height, width, 3)}, got {points_mm.shape}"
+                    f"points_mm must have shape {(height, width, 3)}, got {np.shape(points_mm)}"
                 )
-            given = points_mm[np.ix_(rows, columns)].astype(np.float32)
-            given[seeds == 0] = np.nan
-        elif camera is None:
-            camera = Camera.kinect(width, height)
-        return cls(columns, rows, seeds, (height, width), camera, given)
+            points = np.ma.filled(np.ma.asarray(points_mm)[cells].astype(np.float32), np.nan)
+            given = np.ascontiguousarray(points)
+            given[seeds_mm == 0] = np.nan
+        else:
+            camera = camera or Camera.kinect(width, height)
+            warn_of_metres(image, seeds_mm, "depth_mm")
+        return cls(columns, rows, seeds_mm, (height, width), camera, given)
+
+    @classmethod
+    def measured(
+        cls,
+        measure: Measure,
+        shape: tuple[int, int],
+        seeds: tuple[int, int] = (128, 128),
+        *,
+        camera: Camera | None = None,
+    ) -> SeedGrid:
+        """Take the seeds from a sensor that is asked pixel by pixel; no frame is needed.
+
+        Parameters
+        ----------
+        measure : callable
+            The sensor: pixels (n, 2), column first, to depth (n,) in millimetres. Asked once.
+        shape : tuple of int
+            Height and width of what it can see, in pixels.
+        seeds : tuple of int, default (128, 128)
+            Rows and columns of the lattice.
+        camera : Camera, optional
+            Intrinsics; by default a pinhole with a Kinect's field of view is assumed.
+
+        Raises
+        ------
+        ValueError
+            If the lattice does not fit or the sensor does not answer with a depth per pixel.
+
+        Examples
+        --------
+        >>> grid = SeedGrid.measured(lambda uv: 1000 + uv[:, 0], (48, 64), seeds=(12, 16))
+        >>> grid.depth_mm[0, :3].tolist()
+        [1002.0, 1006.0, 1010.0]
+        """
+        height, width = shape
+        grid = cls(
+            cell_centres(width, seeds[1], "columns of seeds"),
+            cell_centres(height, seeds[0], "rows of seeds"),
+            np.zeros(seeds, np.float32),
+            (height, width),
+            camera or Camera.kinect(width, height),
+        )
+        _, mm = answers(measure, grid.lattice_uv.reshape(-1, 2))
+        return replace(grid, depth_mm=mm.reshape(seeds))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -132,8 +185,7 @@ class SeedGrid:
         """Metric point of every seed, shape (R, C, 3), NaN where missing."""
         if self.given_points_mm is not None:
             return self.given_points_mm
-        assert self.camera is not None
-        return self.camera.points_mm(self.lattice_uv, self.depth_mm)
+        return self.points_at(self.lattice_uv, self.depth_mm)
 
     @cached_property
     def uv(self) -> npt.NDArray[np.int32]:
@@ -144,3 +196,59 @@ class SeedGrid:
     def points_mm(self) -> npt.NDArray[np.float32]:
         """Metric points of the seeds that returned depth, shape (n, 3), row by row."""
         return np.ascontiguousarray(self.lattice_points_mm[self.valid])
+
+    def points_at(
+        self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.float32]
+    ) -> npt.NDArray[np.float32]:
+        """Metric points of pixels (..., 2) of the frame with these depths, shape (..., 3).
+
+        Without a camera, the rays between the seeds' own are interpolated.
+
+        Raises
+        ------
+        ValueError
+            If there is neither a camera nor the seeds' metric points.
+        """
+        if self.camera is not None:
+            return self.camera.points_mm(uv, depth_mm)
+        if self.given_points_mm is None:
+            raise ValueError(
+                "the seeds have neither a camera nor metric points; give SeedGrid a camera, or"
+                " use SeedGrid.from_array(..., points_mm=...)"
+            )
+        # Rays of the nearest seeds in the image, the nearer the heavier; at a seed its own.
+        rays = self.points_mm / self.depth_mm[self.valid][:, None]
+        near = min(4, len(rays))
+        distance, index = cKDTree(self.uv).query(uv, k=[*range(1, near + 1)])
+        weight = 1 / (distance**2 + 1e-9)
+        weight /= weight.sum(axis=-1, keepdims=True)
+        ray = (rays[index] * weight[..., None]).sum(axis=-2)
+        return np.asarray(ray * depth_mm[..., None], np.float32)
+
+
+def answers(
+    measure: Measure, uv: npt.NDArray[np.int32]
+) -> tuple[npt.NDArray[np.generic], npt.NDArray[np.float32]]:
+    """Ask a sensor for pixels (n, 2): its own answer, and depth (n,) in mm, 0 = no return.
+
+    Raises
+    ------
+    ValueError
+        If it does not answer with one number per pixel.
+    IndexError
+        The sensor's own, with a hint at the order of columns and rows.
+    """
+    try:
+        answer = measure(uv)
+    except IndexError as error:
+        raise IndexError(
+            f"the sensor was asked for {len(uv)} pixels, column first, and failed: {error}; of an"
+            " image it is to return image[uv[:, 1], uv[:, 0]]"
+        ) from error
+    mm = measured_mm(answer, "the sensor's answer")
+    if mm.shape != (len(uv),):
+        raise ValueError(
+            f"the sensor was asked for {len(uv)} pixels and answered with shape {mm.shape}; it must"
+            " return one depth per pixel"
+        )
+    return np.ma.getdata(answer), mm

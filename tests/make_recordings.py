@@ -26,18 +26,16 @@ LIMIT_MB = 12
 
 
 def main() -> None:
-    for name in ("workstation", *OTHERS):
+    for name in OTHERS:
         shutil.rmtree(RECORDINGS / name, ignore_errors=True)
     with open_source(ORIGINAL) as source:
         originals = np.stack([frame.depth_mm for frame in source])
     recording = RECORDINGS / "workstation.oni"
     record_oni(originals, recording)
-    # The twin is read back from the recording, so that camera and timestamps are its own.
     with open_source(recording) as source:
         frames = list(source)
     if not np.array_equal(originals, [frame.depth_mm for frame in frames]):
         sys.exit(f"{recording} does not hold the frames that were recorded")
-    write_folder(RECORDINGS / "workstation", frames, compression=9)
     for name, uri in OTHERS.items():
         with open_source(uri) as source:
             write_folder(RECORDINGS / name, source, compression=9)

@@ -18,10 +18,12 @@ class Listener:
     ----------
     follow : str, default ""
         A served stream that it takes in, as a viewer that joins would.
+    port : int, default 0
+        Where it listens; by default at a free port.
     """
 
-    def __init__(self, follow: str = "") -> None:
-        with socket.create_server(("127.0.0.1", 0)) as free:
+    def __init__(self, follow: str = "", port: int = 0) -> None:
+        with socket.create_server(("127.0.0.1", port)) as free:
             self.port = int(free.getsockname()[1])
         self._follow = [follow] if follow else []
         self.process = self.start()

@@ -144,6 +144,7 @@ class Session:
                 source = stack.enter_context(RealtimeSource(source))
             report.live = source.live
             _tell(source)
+            report.troubles += source.notes
             pipeline = stack.enter_context(Pipeline(self.settings, realtime=source.live))
             frames = _frames_in_all(self.settings.run.frames, source.frame_count)
             viewer = self._open_viewer(pipeline, frames)
@@ -157,7 +158,7 @@ class Session:
             except KeyboardInterrupt:
                 self._code = INTERRUPTED
             finally:
-                report.troubles += viewer.close()
+                report.troubles += [*viewer.close(), *viewer.news()]
                 if viewer.file_failed and self._code == OK:
                     self._code = FAILED
                 report.missed = viewer.dropped

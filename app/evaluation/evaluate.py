@@ -19,7 +19,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
@@ -29,11 +28,9 @@ from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
 from selective_depth.selectors.acquire import MOST_ROUNDS, shots_of
 from selective_depth.selectors.parallel import default_threads
+from selective_depth.selectors.quality import errors_of
 from selective_depth.selectors.reconstruct import reconstruct
 
-WRONG_MM = 20.0
-"""A pixel off by more than this, and by more than `WRONG_SHARE` of its depth, is wrong."""
-WRONG_SHARE = 0.02
 ENDLESS_FRAMES = 120
 """So much is looked at of a source without end."""
 
@@ -51,7 +48,7 @@ class Errors:
     rmse_mm, mae_mm : float
         Root mean square and mean absolute error over the pixels with depth, millimetres.
     wrong : float
-        Share of the pixels off by more than `WRONG_MM` and `WRONG_SHARE` of their depth.
+        Share of the pixels that are wrong (`ModelErrors`).
     shots : int
         Measurements spent beyond the seeds.
     missed : float
@@ -75,28 +72,13 @@ class Outcome:
     errors: tuple[Errors, ...]
 
 
-def errors_of(model_mm: npt.NDArray[np.float32], frame: DepthFrame) -> tuple[float, float, float]:
-    """RMSE and MAE in mm and share of wrong pixels of a model, over the pixels with depth."""
-    valid = frame.depth_mm > 0
-    truth_mm = frame.depth_mm[valid].astype(np.float64)
-    error_mm = np.abs(model_mm[valid] - truth_mm)
-    wrong = error_mm > np.maximum(WRONG_MM, WRONG_SHARE * truth_mm)
-    return (
-        float(np.sqrt(np.mean(error_mm**2))),
-        float(np.mean(error_mm)),
-        float(np.mean(wrong)),
-    )
-
-
 def run_strategy(name: str, case: Case) -> Errors:
     """Let a strategy spend its budget on one frame and see what came of it."""
     uv = STRATEGIES[name].pixels(case)
     depth_mm = case.frame.measure(uv)
     model_mm = reconstruct(uv, depth_mm, case.frame.shape)
-    rmse_mm, mae_mm, wrong = errors_of(model_mm, case.frame)
-    return Errors(
-        rmse_mm, mae_mm, wrong, len(uv) - len(case.seed_uv), float(np.mean(depth_mm == 0))
-    )
+    errors = errors_of(model_mm, case.frame.depth_mm)
+    return Errors(*errors, len(uv) - len(case.seed_uv), float(np.mean(depth_mm == 0)))
 
 
 def _evaluate_frame(

@@ -161,7 +161,7 @@ def to_markdown(found: Sequence[Outcome]) -> str:
 def _shown(frame: DepthFrame, name: str, case: Case) -> tuple[Panel, Panel]:
     """Where a strategy measured, and how wrong the model of it is."""
     if name == "loop":
-        acquisition = acquire(frame.measure, case.seeds, case.shots, case.rounds)
+        acquisition = acquire(frame.measure, case.seeds, rounds=case.rounds, shots=case.shots)
         uv, rounds = acquisition.uv, acquisition.round
     else:
         uv = STRATEGIES[name].pixels(case)

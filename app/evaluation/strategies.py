@@ -11,16 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.selectors.acquire import Score, acquire
-from selective_depth.selectors.improvement import (
-    ImprovementSelection,
-    ImprovementSelector,
-    improvement_scattered,
-)
+from selective_depth.selectors.acquire import acquire
+from selective_depth.selectors.even import even_lattice, spread
+from selective_depth.selectors.improvement import ImprovementSelection, ImprovementSelector
 from selective_depth.selectors.neural_gas import NeuralGasSelector, RegionSelection
-from selective_depth.selectors.reconstruct import nearest_sample, reconstruct
+from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.selection import Selector
 
 Pixels = npt.NDArray[np.int32]
 ORACLE_BATCHES = 16
@@ -66,23 +64,14 @@ class Case:
         return reconstruct(self.seed_uv, self.seeds.depth_mm.ravel(), self.frame.shape)
 
     @cached_property
-    def gap_px(self) -> npt.NDArray[np.float32]:
-        """Distance of every pixel to the nearest seed with depth; infinite if there is none."""
-        valid = np.zeros(self.frame.shape, np.bool_)
-        valid[self.seeds.uv[:, 1], self.seeds.uv[:, 0]] = True
-        if not valid.any():
-            return np.full(self.frame.shape, np.inf, np.float32)
-        nearest = nearest_sample(valid)
-        rows, columns = np.indices(self.frame.shape)
-        gap = np.hypot(nearest[..., 0] - columns, nearest[..., 1] - rows)
-        return np.asarray(gap, dtype=np.float32)
+    def samples(self) -> Samples:
+        """The seeds as the first samples."""
+        return Samples.of(self.seeds)
 
     @cached_property
     def open(self) -> npt.NDArray[np.bool_]:
         """Pixels that may be shot in one go: no seed, and not so far from all that it is a hole."""
-        free = self.gap_px <= Samples.of(self.seeds).reach_px
-        free[self.seed_uv[:, 1], self.seed_uv[:, 0]] = False
-        return free
+        return self.samples.open()
 
     @cached_property
     def improvement(self) -> ImprovementSelection:
@@ -96,10 +85,7 @@ class Case:
 
     def lattice(self, pixels: float) -> Pixels:
         """A fresh lattice of square pitch with about so many pixels."""
-        height, width = self.frame.shape
-        rows = min(max(round(height * (pixels / (height * width)) ** 0.5), 1), height)
-        columns = min(max(round(pixels / rows), 1), width)
-        return SeedGrid.from_frame(self.frame, (rows, columns)).lattice_uv.reshape(-1, 2)
+        return even_lattice(self.frame.shape, pixels)
 
     def best(self, worth: npt.NDArray[np.floating]) -> Pixels:
         """Seeds, and the open pixels that are worth most."""
@@ -113,48 +99,13 @@ class Case:
 
     def spread(self, mask: npt.NDArray[np.bool_]) -> Pixels:
         """Seeds, and the budget spread evenly over a mask; what does not fit goes elsewhere."""
-        return self.best(np.where(mask, 2.0, 0.0) - _even_rank(mask.shape))
+        return self.best(spread(mask))
 
 
-def _even_rank(shape: tuple[int, int]) -> npt.NDArray[np.float64]:
-    """Rank 0..1 of pixels such that the first n of any region fill it evenly (ordered dither)."""
-    rows, columns = np.indices(shape)
-    rank = np.zeros(shape, np.int64)
-    bits = 10
-    for bit in range(bits):
-        u, v = columns >> bit & 1, rows >> bit & 1
-        rank |= ((u ^ v) << 1 | v) << 2 * (bits - 1 - bit)
-    return rank / 4.0**bits
-
-
-@dataclass(frozen=True)
-class ImprovementScore(Score):
-    """The published metric (eq. 23) as the score of a closed loop.
-
-    Parameters
-    ----------
-    lattice : tuple of int
-        Rows and columns of the seeds, which set the size of the kriging windows.
-    """
-
-    lattice: tuple[int, int]
-    name = "improvement"
-
-    def map(self, samples: Samples, threads: int | None = None) -> npt.NDArray[np.float32]:
-        """Improvement at every pixel from the samples so far (see `Score.map`)."""
-        rows, columns = np.nonzero(samples.image_mm)
-        uv = np.stack((columns, rows), axis=-1)
-        depth_mm = samples.image_mm[rows, columns]
-        made = improvement_scattered(
-            uv, depth_mm, samples.shape, lattice=self.lattice, threads=threads
-        )
-        raw = made.raw
-        raw[samples.image_mm != 0] = 0
-        return np.nan_to_num(raw)
-
-
-def _loop(case: Case, rounds: int, score: Score | None = None) -> Pixels:
-    return acquire(case.frame.measure, case.seeds, case.shots, rounds, score).uv
+def _loop(case: Case, rounds: int, selector: Selector | None = None) -> Pixels:
+    return acquire(
+        case.frame.measure, case.seeds, rounds=rounds, selector=selector, shots=case.shots
+    ).uv
 
 
 def _gradient(case: Case) -> Pixels:
@@ -212,7 +163,7 @@ class Strategy:
 STRATEGIES: dict[str, Strategy] = {
     "uniform": Strategy("a fresh lattice", lambda c: c.lattice(len(c.seed_uv) + c.shots)),
     "random": Strategy("anywhere near a sample", _random, chance=True),
-    "gap": Strategy("farthest from the samples first", lambda c: c.best(c.gap_px)),
+    "gap": Strategy("farthest from the samples first", lambda c: c.best(c.samples.gap_px())),
     "variance": Strategy(
         "largest kriging variance, local fits",
         lambda c: c.best(np.nan_to_num(c.improvement.variance_mm2)),
@@ -230,7 +181,7 @@ STRATEGIES: dict[str, Strategy] = {
     ),
     "improvement_loop": Strategy(
         "published improvement, closed loop",
-        lambda c: _loop(c, c.rounds, ImprovementScore(c.seeds_shape)),
+        lambda c: _loop(c, c.rounds, ImprovementSelector()),
     ),
     "gradient": Strategy("gradient of the interpolated depth, one shot", _gradient),
     "step": Strategy("step score, one shot", lambda c: _loop(c, 1)),

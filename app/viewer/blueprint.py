@@ -28,27 +28,14 @@ def blueprint(
     limits_mm : tuple of float, default (500, 5000)
         Ends of the depth scale.
     """
-
-    dim_range = list(legend.backdrop_limits_mm(limits_mm))
-
-    def image(name: str, *entities: str, backdrop: bool = False) -> rrb.Spatial2DView:
-        contents = [f"/camera/{entity}" for entity in entities]
-        grey = rr.DepthImage.from_fields(colormap="grayscale", depth_range=dim_range)
-        return rrb.Spatial2DView(
-            origin="/camera",
-            contents=contents + ["/camera/depth", "/camera/holes"] * backdrop,
-            overrides={"/camera/depth": grey} if backdrop else None,
-            background=legend.BACKGROUND,
-            name=name,
-        )
-
-    gas = image("3a Neural gas", "gas/mask", "gas/triangles", "gas/nodes", backdrop=True)
-    gas_long = image("3a Long edges", "gas/complement", backdrop=True)
-    score = image("3b Improvement", "improvement/score", "improvement/unknown")
-    estimate = image("3b Estimate", "improvement/estimate", "improvement/unknown")
-    deviation = image("3b Deviation", "improvement/deviation", "improvement/unknown")
+    grey = _grey(limits_mm)
+    gas = _image("3a Neural gas", "gas/mask", "gas/triangles", "gas/nodes", over=grey)
+    gas_long = _image("3a Long edges", "gas/complement", over=grey)
+    score = _image("3b Improvement", "improvement/score", "improvement/unknown")
+    estimate = _image("3b Estimate", "improvement/estimate", "improvement/unknown")
+    deviation = _image("3b Deviation", "improvement/deviation", "improvement/unknown")
     columns: list[rrb.Container | rrb.View] = [
-        rrb.Vertical(image("1 Sensor", "depth", "holes"), image("2 Seeds", "seeds")),
+        rrb.Vertical(_image("1 Sensor", "depth", "holes"), _image("2 Seeds", "seeds")),
         rrb.Vertical(
             rrb.Tabs(gas, gas_long) if detail else gas,
             rrb.Tabs(score, estimate, deviation) if detail else score,
@@ -58,8 +45,8 @@ def blueprint(
     if acquiring:
         columns.append(
             rrb.Vertical(
-                image("4 Acquired", "samples", "holes"),
-                rrb.Tabs(image("5 Error", "error", "holes"), image("5 Model", "model")),
+                _image("4 Acquired", "samples", "holes"),
+                rrb.Tabs(_image("5 Error", "error", "holes"), _image("5 Model", "model")),
             )
         )
         space.append("/world/samples")
@@ -77,29 +64,10 @@ def blueprint(
             background=legend.BACKGROUND,
         )
     )
-
-    def plot(name: str, *figures: str) -> rrb.TimeSeriesView:
-        contents = [f"/figures/{figure}" for figure in figures]
-        return rrb.TimeSeriesView(
-            origin="/figures", contents=contents, name=name, plot_legend=rrb.Corner2D.LeftTop
-        )
-
+    shares = [1.0] * (len(columns) - 1) + [1.6]
     return rrb.Blueprint(
         rrb.Vertical(
-            rrb.Horizontal(*columns, column_shares=[1.0] * (len(columns) - 1) + [1.6]),
-            rrb.Horizontal(
-                rrb.TextDocumentView(origin="/guide", name="How to read it"),
-                rrb.Spatial2DView(origin="/legend", name="Colours", background=legend.BACKGROUND),
-                plot("Milliseconds per stage", "stages"),
-                rrb.Vertical(
-                    plot("Rate and drops", "fps", "dropped_sensor", "dropped_viewer"),
-                    rrb.StateTimelineView(origin="/sensor/state", name="Sensor"),
-                    row_shares=[2, 1],
-                ),
-                plot("Errors in mm", "quantisation_error_mm", "rmse_mm"),
-                column_shares=[1.15, 1.15, 1, 0.9, 0.9],
-            ),
-            row_shares=[2.2, 1],
+            rrb.Horizontal(*columns, column_shares=shares), _figures(), row_shares=[2.2, 1]
         ),
         rrb.TimePanel(timeline="frame", play_state="following", state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
@@ -108,26 +76,61 @@ def blueprint(
     )
 
 
-def epoch_blueprint(limits_mm: tuple[float, float]) -> rrb.Blueprint:
-    """Layout for trainings of several lengths: nodes, kept triangles and long edges, in space."""
-    grey = rr.DepthImage.from_fields(
-        colormap="grayscale", depth_range=list(legend.backdrop_limits_mm(limits_mm))
+def _image(name: str, *entities: str, over: rr.DepthImage | None = None) -> rrb.Spatial2DView:
+    """View of entities of the camera, alone or over its depth in grey."""
+    contents = [f"/camera/{entity}" for entity in entities]
+    return rrb.Spatial2DView(
+        origin="/camera",
+        contents=contents if over is None else [*contents, "/camera/depth", "/camera/holes"],
+        overrides=None if over is None else {"/camera/depth": over},
+        background=legend.BACKGROUND,
+        name=name,
     )
 
-    def image(name: str, *entities: str) -> rrb.Spatial2DView:
-        contents = ["/camera/depth", "/camera/holes", *(f"/camera/gas/{name}" for name in entities)]
-        return rrb.Spatial2DView(
-            origin="/camera", contents=contents, overrides={"/camera/depth": grey}, name=name
+
+def _grey(limits_mm: tuple[float, float]) -> rr.DepthImage:
+    """How depth looks below something else: dim, within a wider range."""
+    dim_range = list(legend.backdrop_limits_mm(limits_mm))
+    return rr.DepthImage.from_fields(colormap="grayscale", depth_range=dim_range)
+
+
+def _figures() -> rrb.Horizontal:
+    """The lower row: what is seen above, and how the run fares."""
+
+    def plot(name: str, *figures: str) -> rrb.TimeSeriesView:
+        contents = [f"/figures/{figure}" for figure in figures]
+        return rrb.TimeSeriesView(
+            origin="/figures", contents=contents, name=name, plot_legend=rrb.Corner2D.LeftTop
         )
 
+    return rrb.Horizontal(
+        rrb.TextDocumentView(origin="/guide", name="How to read it"),
+        rrb.Spatial2DView(origin="/legend", name="Colours", background=legend.BACKGROUND),
+        plot("Milliseconds per stage", "stages"),
+        rrb.Vertical(
+            plot("Rate and drops", "fps", "dropped_sensor", "dropped_viewer"),
+            rrb.StateTimelineView(origin="/sensor/state", name="Sensor"),
+            row_shares=[2, 1],
+        ),
+        plot("Errors in mm", "quantisation_error_mm", "rmse_mm"),
+        column_shares=[1.15, 1.15, 1, 0.9, 0.9],
+    )
+
+
+def epoch_blueprint(limits_mm: tuple[float, float]) -> rrb.Blueprint:
+    """Layout for trainings of several lengths: nodes, kept triangles and long edges, in space."""
+    grey = _grey(limits_mm)
     space = rrb.Spatial3DView(
         origin="/", contents=["/world/nodes", "/world/regions"], name="In space"
     )
     error = rrb.TimeSeriesView(origin="/figures", name="Quantisation error in mm")
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(image("Nodes", "nodes"), image("Long edges", "complement")),
-            image("Kept triangles", "mask", "triangles"),
+            rrb.Vertical(
+                _image("Nodes", "gas/nodes", over=grey),
+                _image("Long edges", "gas/complement", over=grey),
+            ),
+            _image("Kept triangles", "gas/mask", "gas/triangles", over=grey),
             rrb.Vertical(space, error, row_shares=[2, 1]),
         ),
         rrb.TimePanel(timeline="epoch", state="expanded"),

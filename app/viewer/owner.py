@@ -17,14 +17,17 @@ class Owner:
 
     Attributes
     ----------
-    program : Path or None
-        What it runs; None where that is not known: on systems without ``/proc``, and of other
+    pid : int or None
+        Its number; None where that is not known: on systems without ``/proc``, and of other
         users' processes.
+    program : Path or None
+        What it runs; None likewise.
     same_screen : bool
         Whether its windows are where ours would be; false of other users' processes, true where
         the system does not tell.
     """
 
+    pid: int | None
     program: Path | None
     same_screen: bool
 
@@ -33,7 +36,7 @@ def owner_of(port: int) -> Owner:
     """Who listens on a port of this machine, as Linux tells it under ``/proc``."""
     table = _PROC / "net" / "tcp"
     if not table.is_file():
-        return Owner(None, same_screen=True)
+        return Owner(None, None, same_screen=True)
     links = set()
     for line in table.read_text().splitlines()[1:]:
         _, local, _, state, *_, inode = line.split()[:10]
@@ -44,13 +47,14 @@ def owner_of(port: int) -> Owner:
             if any(str(handle.readlink()) in links for handle in (process / "fd").iterdir()):
                 theirs = (process / "environ").read_bytes().split(b"\0")
                 program = (process / "exe").resolve()
-                return Owner(program, all(_same(name, theirs) for name in SCREENS))
+                same = all(_same(name, theirs) for name in SCREENS)
+                return Owner(int(process.name), program, same)
         except OSError:
             continue  # another user's, or it has just ended
-    return Owner(None, same_screen=False)
+    return Owner(None, None, same_screen=False)
 
 
 def _same(name: str, theirs: list[bytes]) -> bool:
-    ours = os.environ.get(name)
-    value = next((each for each in theirs if each.startswith(f"{name}=".encode())), None)
-    return value == (None if ours is None else f"{name}={ours}".encode())
+    start = f"{name}=".encode()
+    value = next((os.fsdecode(each[len(start) :]) for each in theirs if each.startswith(start)), "")
+    return value.removesuffix(".0") == os.environ.get(name, "").removesuffix(".0")

@@ -21,7 +21,7 @@ from selective_depth.app.console.output import cannot_write
 from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.stream import WRITE_S, Recording
-from selective_depth.app.viewer.window import PORTS, ask, get_window, listens, local_url
+from selective_depth.app.viewer.window import PORTS, ask, get_window, listens, local_url, look_at
 from selective_depth.drivers.errors import OutputError
 
 CHECK_EVERY_S = 1.0
@@ -29,6 +29,11 @@ SPARE_BYTES = 64 << 20
 """Saving ends, with a whole file, when the disk has less room than this."""
 CLOSE_S = 1.0
 """How long a place may take over its last frames."""
+SETTLE_S = 0.5
+CLOSING_S = 4.0
+"""A window that is being closed answers for up to 1.7 s more, and lives for 2.9 s, on a busy
+machine: one that was found is asked again after the first time, and counts as not found at all
+if it goes within the second."""
 SERVE_S = 2.0
 """How long a server may take to listen."""
 
@@ -132,6 +137,7 @@ class FilePlace(Place):
         if not _lock(self._held):
             raise OutputError(f"another run is writing '{path}'; name another file.")
         if free < 2 * SPARE_BYTES:
+            self.discard()
             raise OutputError(
                 f"'{path}' cannot be written: {free >> 20} MiB are free there, and a run leaves"
                 f" {SPARE_BYTES >> 20} MiB of a disk alone. Make room, or name a file elsewhere."
@@ -215,7 +221,6 @@ class RemotePlace(Place):
         super().__init__(name or f"viewer at {url}", showing)
         self.url = url
         self._checked_s = 0.0
-        self._seen = False
         self._address = _host_and_port(url)
         self._meet()
 
@@ -224,17 +229,15 @@ class RemotePlace(Place):
         if self._recording is None and time.monotonic() - self._checked_s > CHECK_EVERY_S:
             self._checked_s = time.monotonic()
             if self._is_back():
-                self.open()
+                self._recording = self._connect()
         if self._recording is None:
             self.missed += isinstance(item, FrameResult)
             return
         super().put(item)
-        if self._recording.flush():
-            self._seen = True
-            return
-        self._recording.abandon()
-        self._recording = None
-        self._lose(item)
+        if not self._recording.flush():
+            self._recording.abandon()
+            self._recording = None
+            self._lose(item)
 
     def close(self) -> None:
         """Send what is left and let go; say so if the viewer has gone meanwhile."""
@@ -278,27 +281,46 @@ class WindowPlace(RemotePlace):
 
     def __init__(self, showing: Showing, taken: Container[int]) -> None:
         self._taken = taken
-        self.awake = True
         super().__init__(local_url(PORTS[0]), showing, "viewer window")
 
+    def open(self) -> None:
+        """Open the recording; in another window if the one that was found is just closing."""
+        if self._window.found:
+            time.sleep(SETTLE_S)
+            if not self._is_back():
+                self._meet()
+        super().open()
+
+    def put(self, item: FrameResult | SensorNote) -> None:
+        """Log a step and see it off, however long the viewer takes."""
+        self._sent += isinstance(item, FrameResult)
+        super().put(item)
+
+    @property
+    def awake(self) -> bool:
+        """Whether the window has answered; one that has not may still be opening, or never."""
+        return self._window.awake
+
     def _meet(self) -> None:
-        window = get_window(self.showing.options, self._taken)
-        self.awake, self.url = window.awake, window.url
+        self._window = get_window(self.showing.options, self._taken)
+        self._since_s, self._sent = time.monotonic(), 0
+        self.url = self._window.url
         self._address = _host_and_port(self.url)
-        for note in window.notes:
+        for note in self._window.notes:
             self.showing.tell(note)
 
     def _is_back(self) -> bool:
-        listener = ask(self.url) if super()._is_back() else None
+        listener = look_at(self._address[1])
         return listener is not None and listener.fits
 
     def _lose(self, item: FrameResult | SensorNote) -> None:
-        if self._seen:
+        if not self._window.found or time.monotonic() - self._since_s > CLOSING_S:
             super()._lose(item)
             return
-        # It was being closed when it was found: nothing was seen of the run, so open another.
+        self.showing.tell("The viewer window that was open was just closing; another is opened.")
+        self.missed += self._sent - isinstance(item, FrameResult)
         self._meet()
-        self.open()
+        super().open()
         self.put(item)
 
 

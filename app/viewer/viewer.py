@@ -89,18 +89,7 @@ class Viewer:
                 if isinstance(place, FilePlace):
                     place.discard()
             raise
-        self._ways: list[Handover[FrameResult | SensorNote]] = []
-        for place in self._places:
-            file = isinstance(place, FilePlace)
-            self._ways.append(
-                Handover(
-                    place.name,
-                    place,
-                    lossless=file and not live,
-                    patience_s=0.0 if live else STALL_S,
-                    capacity=FILE_QUEUE if file and live else 2,
-                )
-            )
+        self._fed = [(place, _handover(place, live)) for place in self._places]
         self._see_served()
 
     def _open_all(self, showing: Showing, fallback: Path | None) -> None:
@@ -115,17 +104,17 @@ class Viewer:
             return
         display = has_display()
         why = self._open_window(showing) if display else "No display here."
-        saved = bool(why) and fallback is not None and not (options.save or options.serve)
-        if saved and fallback is not None:
+        if why and fallback is not None and not (options.save or options.serve):
             self._save_instead(fallback, showing)
-            why += f" Saving to {fallback}; open it with 'rerun {fallback}'."
-        if saved or (why and display):
+            self._news.append(f"{why} Saving to {fallback}; open it with 'rerun {fallback}'.")
+        elif why and display:
             self._news.append(why)
 
     def _open_window(self, showing: Showing) -> str:
         """Open it; returns why the run cannot rely on it, in a sentence, or nothing."""
         try:
-            window = WindowPlace(showing, self._served_ports)
+            served = [place.port for place in self._places if isinstance(place, ServedPlace)]
+            window = WindowPlace(showing, served)
         except ViewerError as error:
             return f"{str(error)[0].upper()}{str(error)[1:]}"
         self._places.append(window)
@@ -144,16 +133,12 @@ class Viewer:
 
     def _see_served(self) -> None:
         """Wait until a stream that is to be served is served."""
-        for place, way in zip(self._places, self._ways, strict=True):
+        for place, way in self._fed:
             if isinstance(place, ServedPlace):
                 way.ready.wait(READY_S)
                 if way.failure is not None:
                     self.close()
                     raise way.failure
-
-    @property
-    def _served_ports(self) -> list[int]:
-        return [place.port for place in self._places if isinstance(place, ServedPlace)]
 
     def news(self) -> list[str]:
         """What has happened to the places since the last call, a sentence each."""
@@ -162,13 +147,14 @@ class Viewer:
     @property
     def served_url(self) -> str:
         """Address at which viewers join; empty if nothing is served, or no more."""
-        pairs = zip(self._places, self._ways, strict=True)
-        served = [p.url for p, way in pairs if isinstance(p, ServedPlace) and way.failure is None]
-        return served[0] if served else ""
+        for place, way in self._fed:
+            if isinstance(place, ServedPlace) and way.failure is None:
+                return place.url
+        return ""
 
     def wait_ready(self) -> None:
         """Wait until every place is open, though for none that stalls."""
-        for way in self._ways:
+        for _, way in self._fed:
             way.ready.wait(READY_S)
 
     def show(self, item: FrameResult | SensorNote) -> None:
@@ -179,7 +165,7 @@ class Viewer:
         Exception
             What ended the file that was asked for; a viewer that is gone is no error.
         """
-        for place, way in zip(self._places, self._ways, strict=True):
+        for place, way in self._fed:
             way.offer(item)
             if isinstance(place, FilePlace) and way.failure is not None:
                 raise way.failure
@@ -187,14 +173,12 @@ class Viewer:
     @property
     def file_failed(self) -> bool:
         """Whether a file that was asked for ended before its time."""
-        pairs = zip(self._places, self._ways, strict=True)
-        return any(isinstance(place, FilePlace) and way.failure for place, way in pairs)
+        return any(isinstance(place, FilePlace) and way.failure for place, way in self._fed)
 
     @property
     def dropped(self) -> dict[str, int]:
         """Steps that each place has missed, by its name."""
-        pairs = zip(self._places, self._ways, strict=True)
-        return {place.name: place.missed + way.dropped for place, way in pairs}
+        return {place.name: place.missed + way.dropped for place, way in self._fed}
 
     def close(self) -> list[str]:
         """Finish every place, all of them within 3 s.
@@ -207,12 +191,23 @@ class Viewer:
         never_wait_at_exit()
         deadline_s = time.monotonic() + CLOSE_ALL_S
         troubles = []
-        for way in self._ways:
+        for _, way in self._fed:
             if not way.finish(max(0.1, deadline_s - time.monotonic())):
                 troubles.append(f"the {way.name} had stalled and was left behind.")
             elif way.failure is not None:
                 troubles.append(f"the {way.name} ended early: {way.failure}")
-        return self.news() + troubles
+        return troubles
+
+
+def _handover(place: Place, live: bool) -> Handover[FrameResult | SensorNote]:
+    file = isinstance(place, FilePlace)
+    return Handover(
+        place.name,
+        place,
+        lossless=file and not live,
+        patience_s=0.0 if live else STALL_S,
+        capacity=FILE_QUEUE if file and live else 2,
+    )
 
 
 def _application(title: str, options: ViewerOptions) -> str:

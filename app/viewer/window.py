@@ -32,8 +32,12 @@ PROBE_S = 0.3
 and lose what is logged."""
 ASK_S = 3.0
 """How long a viewer may take to say what it is; it answers between two of its pictures."""
+ASK_OURS_S = 0.5
+"""The same for our own program: its servers, which are to be told apart, answer at once."""
 BIRTH_S = 5.0
 """How long a window may take to open before the run goes on."""
+TRIES = 3
+"""How often a port that another program has taken in the meantime is changed."""
 _LEAST_GAP_S = 0.05
 
 
@@ -70,6 +74,8 @@ class Window:
     ----------
     url : str
         Where it listens.
+    found : bool
+        Whether it was open already.
     awake : bool
         Whether it has answered; one that has not may still be opening, or never.
     notes : tuple of str
@@ -77,6 +83,7 @@ class Window:
     """
 
     url: str
+    found: bool
     awake: bool
     notes: tuple[str, ...] = ()
 
@@ -151,46 +158,52 @@ def get_window(options: ViewerOptions, taken: Container[int] = ()) -> Window:
         If none is open and none starts, with the reason.
     """
     ports = [port for port in PORTS if port not in taken]
-    with ThreadPoolExecutor(len(ports)) as pool:
-        there = dict(zip(ports, pool.map(_look_at, ports), strict=True))
-    for port, listener in there.items():
-        if listener is not None and listener.fits:
-            default = ViewerOptions().viewer_memory
+    for _ in range(TRIES):
+        with ThreadPoolExecutor(len(ports)) as pool:
+            there = dict(zip(ports, pool.map(look_at, ports), strict=True))
+        found = next((port for port, it in there.items() if it is not None and it.fits), None)
+        if found is not None:
             note = (
                 "The viewer window that is open is used. It keeps the memory it was started with;"
                 " close it for --viewer-memory to count."
             )
-            notes = (note,) * (options.viewer_memory != default)
-            return Window(local_url(port), awake=True, notes=notes)
-    for port, listener in there.items():
-        if listener is None:
+            asked = options.viewer_memory != ViewerOptions().viewer_memory
+            return Window(local_url(found), found=True, awake=True, notes=(note,) * asked)
+        port = next((port for port, it in there.items() if it is None), None)
+        if port is None:
+            break
+        awake = _start(port, options)
+        if awake is not None:
             notes = tuple(
                 f"Port {other} has {it.name}; the viewer window listens on {port}."
                 for other, it in there.items()
                 if it is not None and other < port
             )
-            return Window(local_url(port), awake=_start(port, options), notes=notes)
+            return Window(local_url(port), found=False, awake=awake, notes=notes)
     raise ViewerError(
         f"the viewer window does not start: the ports {PORTS[0]}..{PORTS[-1]} all have other"
         " programs. End one, or use --save FILE.rrd --headless."
     )
 
 
-def _look_at(port: int) -> Listener | None:
+def look_at(port: int) -> Listener | None:
     """What is on a port of this machine; a viewer on another screen, or not ours, fits nobody."""
-    listener = ask(local_url(port)) if listens(("127.0.0.1", port)) else None
-    if listener is None or not (listener.viewer or listener.silent):
+    if not listens(("127.0.0.1", port)):
+        return None
+    owner, program = owner_of(port), viewer_executable()
+    ours = owner.same_screen and program is not None and owner.program == Path(program).resolve()
+    listener = ask(local_url(port), ASK_OURS_S if ours else ASK_S)
+    if listener is None or (listener.viewer and owner.same_screen):
         return listener
-    owner, ours = owner_of(port), viewer_executable()
-    if not owner.same_screen:
+    if listener.viewer:
         return replace(listener, name=f"{listener.name} on another screen", fits=False)
-    # A viewer that paints for seconds does not answer; that it is of our version shows its file.
-    busy = ours is not None and owner.program == Path(ours).resolve()
-    return replace(listener, fits=listener.fits or (listener.silent and busy))
+    return replace(listener, fits=ours and listener.silent)
 
 
-def _start(port: int, options: ViewerOptions) -> bool:
-    """Start a viewer and watch its birth; False if it lives but has not answered in time.
+def _start(port: int, options: ViewerOptions) -> bool | None:
+    """Start a viewer and watch its birth.
+
+    False if it lives but has not answered in time, None if another program had the port first.
 
     It is started here and not by the SDK, whose `spawn` lets everyone in the network read and
     write, hands it this program's output (so that a pipe from here never ends), and takes 20 s
@@ -216,7 +229,7 @@ def _start(port: int, options: ViewerOptions) -> bool:
                 stderr=complaints,
                 start_new_session=True,
                 creationflags=getattr(subprocess, "DETACHED_PROCESS", 0),
-                env={"RUST_LOG": "error"} | os.environ,
+                env={"RUST_LOG": "error", "RERUN_APP_ONLY": "true"} | os.environ,
             )
         except OSError as error:
             raise ViewerError(
@@ -230,13 +243,15 @@ def _start(port: int, options: ViewerOptions) -> bool:
             raise
 
 
-def _is_born(process: subprocess.Popen[bytes], port: int, complaints: IO[bytes]) -> bool:
-    """Wait until a viewer answers; False if it only listens after `BIRTH_S`."""
+def _is_born(process: subprocess.Popen[bytes], port: int, complaints: IO[bytes]) -> bool | None:
+    """Wait until a viewer answers; False and None as for `_start`."""
     deadline_s = time.monotonic() + BIRTH_S
     while (left_s := deadline_s - time.monotonic()) > 0:
         if process.poll() is not None:
+            if process.returncode == 0 or listens(("127.0.0.1", port)):
+                return None  # as it ends where somebody listens already
             raise ViewerError(f"the viewer window does not start: {_reason(process, complaints)}")
-        if listens(("127.0.0.1", port)):
+        if listens(("127.0.0.1", port)) and owner_of(port).pid in (None, process.pid):
             listener = ask(local_url(port), left_s)
             if listener is not None and listener.viewer:
                 return True

@@ -22,9 +22,12 @@ import re
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as FutureTimeoutError
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from decimal import Decimal
 from pathlib import Path, PurePosixPath
-from typing import Final
+from types import TracebackType
+from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -57,6 +60,10 @@ _TUM_CAMERAS: Final = {
 }
 _PRIMESENSE: Final = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _SEVEN_SCENES: Final = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
+
+
+_DECIMAL: Final = r"[0-9]{1,30}\.[0-9]{1,30}"
+"""A file name that is one number: a time, as a rule."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +109,7 @@ class RecordedFolder(DepthSource):
         settings = sidecar.over(layout.means)
         self.layout = layout.name
         self._files = layout.files
+        self.notes = _doubtful_order(layout.files)
         self.frame_count = len(layout.files)
         self.dropped = 0
         self.camera = _camera_of(layout, sidecar.camera)
@@ -122,6 +130,7 @@ class RecordedFolder(DepthSource):
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         """Return the next frame; see `DepthSource.read`."""
+        self.check_process()
         if self._closed:
             raise SourceEndedError(f"'{self.uri}' was closed; open it again to read it again.")
         if self._next == self.frame_count:
@@ -156,14 +165,16 @@ class RecordedFolder(DepthSource):
         else:
             timestamp_us = self._timestamps_us[index]
         depth_mm = raw if self._to_mm is None else self._to_mm[raw]
-        return DepthFrame(depth_mm, index, timestamp_us, self.camera, str(path))
+        depth_mm.flags.writeable = False  # handed over: the frame need not copy it
+        return DepthFrame(depth_mm, index, timestamp_us, self.camera, self.uri)
 
 
 class FolderWriter:
     """Writes frames as a plain folder: ``000000.png`` … and the sidecar.
 
-    The sidecar is there from the first frame on and complete after `close`, so that an
-    interrupted recording keeps what it has.
+    The sidecar is there from the first frame on and complete after `close`, so that what a killed
+    program leaves can be read. As a context manager it leaves
+    nothing where writing failed.
 
     Parameters
     ----------
@@ -187,6 +198,7 @@ class FolderWriter:
         self._compression = compression
         self._sidecar = Sidecar(values_per_metre=_MILLIMETRES, fps=fps)
         self._timestamps_us: list[int] = []
+        self._made = not self.path.exists()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             used = any(
@@ -216,7 +228,7 @@ class FolderWriter:
                 f"frame {frame.index} has {frame.camera}, but the folder '{self.path}' is of"
                 f" {self._sidecar.camera}; write it to another folder"
             )
-        file = self.path / f"{len(self._timestamps_us):06d}.png"
+        file = self._file(len(self._timestamps_us))
         try:
             write_png(file, frame.depth_mm, self._compression)
         except OSError as error:
@@ -231,11 +243,31 @@ class FolderWriter:
             self._sidecar = replace(self._sidecar, timestamps_us=tuple(self._timestamps_us))
             self._write_sidecar()
 
-    def __enter__(self) -> FolderWriter:
+    def discard(self) -> None:
+        """Remove what was written, so that it is not in the way of the next attempt."""
+        for index in range(len(self._timestamps_us)):
+            self._file(index).unlink(missing_ok=True)
+        (self.path / SIDECAR).unlink(missing_ok=True)
+        self._timestamps_us.clear()
+        if self._made:
+            with suppress(OSError):  # somebody else has put something there meanwhile
+                self.path.rmdir()
+
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if isinstance(error, OutputError | ValueError):
+            self.discard()  # a source that failed leaves what it gave; a writer, nothing
         self.close()
+
+    def _file(self, index: int) -> Path:
+        return self.path / f"{index:06d}.png"
 
     def _write_sidecar(self) -> None:
         try:
@@ -322,9 +354,26 @@ def _png_names(folder: Path) -> list[str]:
     return sorted((name for name in names if not name.startswith(".")), key=_natural_key)
 
 
-def _natural_key(name: str) -> list[tuple[int, int, str]]:
+def _natural_key(name: str) -> list[tuple[int, Decimal, str]]:
+    stem = name.rpartition(".")[0]
+    if re.fullmatch(_DECIMAL, stem):
+        return [(0, Decimal(stem), name)]
     parts = re.findall(r"[0-9]+|[^0-9]+", name)
-    return [(0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts]
+    return [
+        (0, Decimal(part), part) if part.isdecimal() else (1, Decimal(0), part) for part in parts
+    ]
+
+
+def _doubtful_order(files: list[Path]) -> tuple[str, ...]:
+    """Say it where the names can be read as two kinds of numbers, which order them differently."""
+    matches = [re.fullmatch(r"([0-9]+)\.([0-9]+)", path.stem) for path in files]
+    pairs = [(int(each[1]), int(each[2])) for each in matches if each]
+    if len(pairs) < len(files) or pairs == sorted(pairs):
+        return ()
+    return (
+        f"the names of the frames ('{files[0].name}', …) are read as decimal numbers. If they are"
+        f" seconds and nanoseconds without leading zeros, that is another order: rename them.",
+    )
 
 
 def _tum_layout(path: Path) -> _Layout:

@@ -27,7 +27,7 @@ from typing import Any, Final
 
 from selective_depth.drivers.errors import DamagedRecordingError
 from selective_depth.drivers.folder.images import MAX_SIDE
-from selective_depth.drivers.frame import Camera
+from selective_depth.drivers.frame import MOST_PX, MOST_TIME_US, Camera
 
 SIDECAR: Final = "frames.toml"
 
@@ -92,7 +92,7 @@ def read_sidecar(folder: Path) -> Sidecar:
         camera=_camera(path, entries),
         fps=_number(path, entries, "fps", 1e-3, 1e4),
         missing=_integers(path, entries, "missing", 0, 65535),
-        timestamps_us=_integers(path, entries, "timestamps_us", -(2**62), 2**62),
+        timestamps_us=_integers(path, entries, "timestamps_us", -MOST_TIME_US, MOST_TIME_US),
     )
 
 
@@ -108,8 +108,12 @@ def write_sidecar(folder: Path, sidecar: Sidecar) -> None:
         lines.append("\n[camera]")
         lines.extend(f"{key} = {getattr(sidecar.camera, key)!r}" for key in _CAMERA_KEYS)
     new = folder / f"{SIDECAR}.new"
-    new.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    new.replace(folder / SIDECAR)
+    try:
+        new.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        new.replace(folder / SIDECAR)
+    except OSError:
+        new.unlink(missing_ok=True)
+        raise
 
 
 def read_text(path: Path) -> str:
@@ -151,7 +155,7 @@ def _camera(path: Path, entries: dict[str, Any]) -> Camera | None:
         if not _is_integer(table[key]) or not 1 <= table[key] <= MAX_SIDE:
             raise _wrong(path, key, table[key], f"a whole number from 1 to {MAX_SIDE}")
     for key in _CAMERA_KEYS[2:]:
-        _number(path, table, key, -1e6, 1e6)
+        _number(path, table, key, -MOST_PX, MOST_PX)
     try:
         return Camera(
             table["width"], table["height"], *(float(table[key]) for key in _CAMERA_KEYS[2:])

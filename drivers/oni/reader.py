@@ -18,7 +18,7 @@ class OniReader(DepthSource):
 
     Delivers what was recorded, bit by bit, needs no runtime and runs no native code on the file.
     A damaged file is read up to the damage; a recording whose recorder was killed is read to its
-    last whole frame.
+    last whole frame, and `notes` says so.
 
     Parameters
     ----------
@@ -44,6 +44,11 @@ class OniReader(DepthSource):
         self.uri = str(path)
         self.report = inspect_oni(path)
         self.dropped = 0
+        if self.report.problems:
+            self.notes = (
+                f"'{path}' is not whole ({self.report.problems[0]}); `selective-depth check` says"
+                " more, and saves what can be saved with --repair.",
+            )
         self._frames, self._damage = _trusted_frames(self.report)
         if self._damage is not None and not self._frames:
             raise DamagedRecordingError(self._sentence(self._damage))
@@ -66,6 +71,7 @@ class OniReader(DepthSource):
         DamagedRecordingError
             Where the file is damaged; frames already delivered are good.
         """
+        self.check_process()
         if self._file is None:
             raise SourceEndedError(f"'{self.uri}' has been closed.")
         if self._next == len(self._frames):
@@ -80,6 +86,7 @@ class OniReader(DepthSource):
             self._frames = self._frames[: self._next]
             self._damage = f"byte {frame.record_offset}: frame {frame.number} cannot be decoded"
             raise DamagedRecordingError(self._sentence(self._damage))
+        depth_mm.flags.writeable = False  # handed over: the frame need not copy it
         index = self._next
         self._next += 1
         return DepthFrame(depth_mm, index, frame.timestamp_us, self.camera, self.uri)
@@ -98,9 +105,15 @@ class OniReader(DepthSource):
 
 
 def _trusted_frames(report: OniReport) -> tuple[list[OniFrame], str | None]:
-    """Frames before the first damage, and what that is; None if the file is sound."""
+    """Frames before the first damage, and what that is; None if nothing in them is damaged.
+
+    A file that was cut, or whose recorder was killed, has no END mark and no frame beyond what is
+    wrong with it: what is there is good.
+    """
     frames = report.depth.frames if report.depth is not None else []
     damage = next((problem for problem in report.problems if not problem.harmless), None)
     if damage is None:
         return frames, None
-    return [frame for frame in frames if frame.record_offset < damage.offset], str(damage)
+    before = [frame for frame in frames if frame.record_offset < damage.offset]
+    cut = not report.ended and len(before) == len(frames) > 0
+    return before, None if cut else str(damage)

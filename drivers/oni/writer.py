@@ -229,8 +229,10 @@ class OniWriter:
         since_us = frame.timestamp_us - self._first_us
         if since_us < 0:
             raise ValueError(
-                f"frame {frame.index} is {-since_us} us older than the first; frames must be in"
-                " the order of their time"
+                f"frame {frame.index} of '{frame.source}' is {-since_us} us older than the first:"
+                " its clock wrapped round or jumped back. Give rising timestamps_us in the folder's"
+                " frames.toml (2^32 more from there on, for a clock of 32 bits), or export to a"
+                " folder"
             )
         self._writer.add_frame(1, since_us, encode_depth(frame.depth_mm))
 
@@ -249,6 +251,8 @@ class OniWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        if isinstance(error, OutputError | ValueError):
+            self._writer.discard()  # a source that failed leaves what it gave; a writer, nothing
         self.close()
 
     def _begin(self, frame: DepthFrame) -> None:

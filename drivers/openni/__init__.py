@@ -1,19 +1,17 @@
-"""Depth through OpenNI2: live sensors, `.oni` recordings, and recording.
+"""Depth through OpenNI2: live sensors, and recording them.
 
-OpenNI2 itself runs in a process of its own (`openni_worker`): what crashes or hangs there
+OpenNI2 itself runs in a process of its own (`worker`): what crashes or hangs there
 becomes a named error here, and frames already delivered stay good.
 """
 
 from selective_depth.drivers.openni.device import DeviceSettings, OpenNIDevice
 from selective_depth.drivers.openni.recorder import RecordingReport, record
-from selective_depth.drivers.openni.replay import OpenNIRecording
 from selective_depth.drivers.openni.sensors import DeviceInfo, list_devices, runtime_version
 
 __all__ = [
     "DeviceInfo",
     "DeviceSettings",
     "OpenNIDevice",
-    "OpenNIRecording",
     "RecordingReport",
     "list_devices",
     "record",

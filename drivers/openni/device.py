@@ -182,6 +182,7 @@ class OpenNIDevice(DepthSource):
         SourceEndedError
             If the source has been closed.
         """
+        self.check_process()
         with self._changed:
             self._changed.wait_for(
                 lambda: self._newest or self._failure or self._closing.is_set(), timeout_s

@@ -10,11 +10,10 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from selective_depth.drivers.errors import DeviceRefusedError, OutputError, SourceError
+from selective_depth.drivers.errors import DeviceRefusedError, OutputError
 from selective_depth.drivers.oni import inspect_oni, mend_oni
 from selective_depth.drivers.openni.device import DeviceSettings
 from selective_depth.drivers.openni.process import Worker, error_of
-from selective_depth.drivers.openni.replay import OpenNIRecording
 
 _OPEN_S = 10.0  # a sensor that loads its firmware takes seconds
 _STALL_S = 5.0  # silence of the sensor after which a recording is ended
@@ -200,11 +199,6 @@ def _verify(path: Path, seen: int) -> tuple[int, str]:
     os.truncate(path, report.size_bytes - report.tail_bytes)
     # It also swaps two bytes of frames that end in a certain way; players would show that.
     mend_oni(path)
-    try:
-        with OpenNIRecording(path) as recording:
-            declared = recording.frame_count
-    except SourceError as error:
-        return frames, f"OpenNI2 does not open the recording again: {error}"
-    if frames < seen or frames != declared:
-        return frames, f"'{path}' has {frames} frames and says {declared}; the sensor made {seen}."
+    if frames < seen:
+        return frames, f"'{path}' has {frames} frames; the sensor made {seen}."
     return frames, ""

@@ -26,7 +26,6 @@ from primesense import openni2
 from primesense.utils import OpenNIError
 
 WAIT_S = 0.2  # longest uninterrupted wait for a frame, and the beat of "idle" messages
-SILENT_FILE_S = 5.0  # a file in lock-step delivers within milliseconds; beyond this it is stuck
 LEAVE_S = 3.0  # from the parent's end to this process's, at most
 SETTLE_S = 0.05  # between stop and close: the runtime's threads set their flags late
 RECORDER_START_S = 5.0  # for the recorder's own thread to write the file's beginning
@@ -127,15 +126,12 @@ class Slots:
         for slot in range(job["slots"]):
             parent.free_slots.put(slot)
 
-    def take(self, wait: bool) -> int | None:
-        """A free slot; None if there is none (or, when waiting, if it is time to stop)."""
-        while not self._parent.stop.is_set():
-            try:
-                return self._parent.free_slots.get(timeout=WAIT_S if wait else 0)
-            except queue.Empty:
-                if not wait:
-                    return None
-        return None
+    def take(self) -> int | None:
+        """A free slot; None if there is none."""
+        try:
+            return self._parent.free_slots.get_nowait()
+        except queue.Empty:
+            return None
 
     def fill(self, slot: int, address: int, size: int) -> None:
         """Copy an image from the runtime's memory, which it will use again."""
@@ -411,7 +407,7 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
             continue
         last_frame = time.monotonic()
         problem = misfit(frame, width, height)
-        slot = None if problem else slots.take(wait=False)
+        slot = None if problem else slots.take()
         if slot is not None:
             slots.fill(slot, frame.data, frame.dataSize)
             parent.send("frame", slot=slot, index=frame.frameIndex, timestamp_us=frame.timestamp)
@@ -436,67 +432,6 @@ def native_name(descriptor: int, path: str) -> bytes:
             " letters. Move the file.",
         )
     return path.encode()
-
-
-def run_recording(job: dict[str, Any], parent: Parent) -> None:
-    """Deliver every frame of a recording, each exactly once."""
-    path = job["path"]
-
-    def damaged(what: str) -> JobError:
-        return JobError(
-            "DamagedRecordingError",
-            f"'{path}' {what}. `selective-depth check` says what can be saved.",
-        )
-
-    initialize(job)
-    slots = Slots(job, parent)
-    try:
-        # O_NONBLOCK: should the file have become a pipe since it was checked, nothing waits.
-        file = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-        device = Device(native_name(file, path))
-        stream = device.create_depth_stream()
-    except OSError as error:
-        raise JobError(
-            "SourceNotFoundError", f"'{path}' cannot be read: {error.strerror}."
-        ) from error
-    except OpenNIError as error:
-        raise damaged(f"cannot be opened: {reason(error)}") from error
-    if stream is None:
-        raise damaged("holds no depth stream")
-    about = describe(stream)
-    count = min(stream.get_number_of_frames(), job["readable"])
-    width, height = about["width"], about["height"]
-    if count < 1:
-        raise damaged("was not closed when it was recorded: it does not say how many frames it has")
-    if not slots.fits(width * height * 2):
-        raise damaged(f"claims frames of {width}x{height} pixels")
-    # -1.0 is lock-step: the player waits for the reader. As a float: an int is stored as NaN.
-    device.playback.set_speed(-1.0)
-    # With repeat off the player spins after the last frame and may crash; so count instead.
-    device.playback.set_repeat_enabled(True)
-    stream.start()
-    parent.send("opened", **about, frames=count)
-    for expected in range(1, count + 1):
-        frame = None
-        deadline = time.monotonic() + SILENT_FILE_S
-        while frame is None:
-            frame = next_frame(stream)
-            if parent.stop.is_set():
-                return
-            if frame is None and time.monotonic() > deadline:
-                raise damaged(f"gives no frame {expected} of {count}")
-        problem = misfit(frame, width, height)
-        if frame.frameIndex != expected:
-            problem = f"it has number {frame.frameIndex}"
-        if problem:
-            raise damaged(f"has a wrong frame {expected} of {count}: {problem}")
-        slot = slots.take(wait=True)
-        if slot is None:
-            return
-        slots.fill(slot, frame.data, frame.dataSize)
-        parent.send("frame", slot=slot, index=expected - 1, timestamp_us=frame.timestamp)
-        frame.close()
-    parent.send("end")
 
 
 class Recording:
@@ -585,7 +520,6 @@ def run_record(job: dict[str, Any], parent: Parent) -> None:
 JOBS = {
     "list": run_list,
     "device": run_device,
-    "recording": run_recording,
     "record": run_record,
 }
 
@@ -610,8 +544,8 @@ def main() -> None:
     except JobError as error:
         parent.send("error", error=error.kind, message=str(error), remedy=error.remedy)
     except Exception as error:  # noqa: BLE001 - the parent turns it into a named error
-        kind = "DamagedRecordingError" if job["job"] == "recording" else "DeviceLostError"
-        parent.send("error", error=kind, message=f"OpenNI2 failed: {reason(error)}.", remedy="")
+        message = f"OpenNI2 failed: {reason(error)}."
+        parent.send("error", error="DeviceLostError", message=message, remedy="")
     # What is needed is closed. The library's own clean-up at exit can crash or hang.
     os._exit(0)
 

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from selective_depth.selectors.acquire.refinement import finer_lattice
-from selective_depth.selectors.acquire.scores import Score, StepScore
+from selective_depth.selectors.acquire.step import StepSelector
+from selective_depth.selectors.acquire.surface import SurfacePlan, SurfaceSelector
+from selective_depth.selectors.arrays import pixels_in
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.samples import Samples
-from selective_depth.selectors.seeds import SeedGrid
-
-Measure = Callable[[npt.NDArray[np.int32]], npt.NDArray[np.generic]]
-"""A random-access depth sensor: pixels (n, 2), column first, to depth (n,) in mm, 0 = none."""
+from selective_depth.selectors.seeds import Measure, SeedGrid, answers
+from selective_depth.selectors.selection import Selector, Worth, plan_of
 
 MOST_ROUNDS = 254
 """Rounds are counted in a byte, and an image of them needs one value for "never"."""
@@ -54,6 +53,8 @@ class Acquisition:
         Height and width of the frame in pixels.
     rounds : tuple of Round
         Summary of each round after the seeds.
+    plan : SurfacePlan or None
+        What chose the shots, where that has made the model on its way.
     """
 
     uv: npt.NDArray[np.int32]
@@ -61,6 +62,7 @@ class Acquisition:
     round: npt.NDArray[np.uint8]
     frame_shape: tuple[int, int]
     rounds: tuple[Round, ...]
+    plan: SurfacePlan | None = None
 
     @property
     def returned(self) -> npt.NDArray[np.bool_]:
@@ -82,17 +84,28 @@ class Acquisition:
 
     def reconstruct(self, threads: int | None = None) -> npt.NDArray[np.float32]:
         """Dense depth of the model in millimetres, shape (H, W)."""
+        if self.plan is not None:
+            return self.plan.model_mm()
         return reconstruct(self.uv, self.depth_mm, self.frame_shape, threads=threads)
 
 
 def shots_of(budget: float, shape: tuple[int, int]) -> int:
-    """Number of measurements in a budget: an int is a number, a float a share of the pixels."""
+    """Number of measurements in a budget that is a share of the frame's pixels, 0.0 to 1.0.
+
+    A whole number from 2 on is a number of measurements already. An int of 1 may mean one or
+    all, and is refused.
+    """
     pixels = shape[0] * shape[1]
-    shots = budget if isinstance(budget, int | np.integer) else budget * pixels
+    whole = isinstance(budget, int | np.integer)
+    if whole and budget == 1:
+        raise ValueError(
+            "a budget of 1 may be one measurement or every pixel; give shots=1 or budget=1.0"
+        )
+    shots = budget if whole else budget * pixels
     if not 0 <= shots <= pixels:  # NaN is not either
         raise ValueError(
             f"a budget of {budget} is {shots:g} of {pixels} pixels; give a share from 0.0 to 1.0,"
-            " or a whole number of measurements"
+            " or shots as a whole number of measurements"
         )
     return round(float(shots))
 
@@ -108,66 +121,82 @@ def _fits_16_bits(depth_mm: npt.NDArray[np.float32]) -> bool:
     return bool(depth_mm.max(initial=0) <= np.iinfo(np.uint16).max)
 
 
+def best_selector(rounds: int, threads: int | None = None) -> Selector:
+    """The selector that `acquire` takes by default: the best there is for so many rounds.
+
+    In one round there is no model yet that knows where the steps are, only the seeds': there the
+    step score is better, which weighs more samples than a triangle has.
+    """
+    return StepSelector(threads=threads) if rounds == 1 else SurfaceSelector(threads=threads)
+
+
 def acquire(
     measure: Measure,
     seeds: SeedGrid,
     budget: float = 0.05,
     rounds: int = 8,
-    selector: Score | None = None,
+    selector: Selector | Worth | None = None,
     *,
+    shots: int | None = None,
     threads: int | None = None,
 ) -> Acquisition:
-    """Measure where the model is likely to be wrong, round by round.
+    """Measure where a selector says it is worth most, round by round.
 
     Parameters
     ----------
     measure : callable
-        The sensor: pixels (n, 2), column first, to depth (n,) in millimetres; 0, negative or
-        not finite = no return.
+        The sensor: pixels (n, 2), column first, to depth (n,) in millimetres; what is no depth
+        (see `measured_mm`) or masked is no return.
         It is asked for nothing but the chosen pixels, each at most once.
     seeds : SeedGrid
         The first measurements; they are not part of the budget.
-    budget : float or int, default 0.05
-        Float: share of the frame's pixels. Int: number of measurements. A measurement that
-        returns nothing is paid for as well.
+    budget : float, default 0.05
+        Share of the frame's pixels. A measurement that returns nothing is paid for as well.
+        (A whole number from 2 on is taken as `shots`.)
     rounds : int, default 8
         In how many rounds; 1 decides everything from the seeds. Where these are few and far
         apart, the first of several rounds makes their lattice finer (`finer_lattice`).
-    selector : Score, optional
-        What a shot is worth; default `StepScore`.
+    selector : Selector or callable, optional
+        What a shot is worth, from the samples so far: any selector, or a function of one's own
+        (see `plan_of`); default `best_selector`.
+    shots : int, optional
+        The budget as a number of measurements.
     threads : int, optional
-        Kernel threads; default `default_threads()`.
+        Kernel threads of the default selector and of choosing; default `default_threads()`.
 
     Returns
     -------
     Acquisition
         Seeds and shots. It may hold fewer shots than the budget, if there was nothing left
         near any sample.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of its range, the sensor does not answer with one depth per pixel, in
+        millimetres as the seeds, or a selector's plan asks for a pixel twice or for too many.
+    TypeError
+        If `selector` is none.
     """
     if not 1 <= rounds <= MOST_ROUNDS:
         raise ValueError(f"{rounds} rounds were asked for; give between 1 and {MOST_ROUNDS}")
-    score = StepScore() if selector is None else selector
-    shots = shots_of(budget, seeds.frame_shape)
-    even_uv, pitch_px = finer_lattice(seeds, shots if rounds > 1 else 0)
+    total = shots_of(budget, seeds.frame_shape) if shots is None else shots
+    if not 0 <= total <= seeds.frame_shape[0] * seeds.frame_shape[1]:
+        raise ValueError(f"shots is {shots}; give between 0 and the number of the frame's pixels")
+    even_uv, pitch_px = finer_lattice(seeds, total if rounds > 1 else 0)
     samples = Samples.of(seeds, pitch_px)
-    plan = score.plan(samples, threads)
-    lattice_uv = seeds.lattice_uv.reshape(-1, 2)
+    plan = plan_of(selector or best_selector(rounds, threads), samples, threads)
     lattice_mm = seeds.depth_mm.ravel()
-    uv, depth = [lattice_uv], [lattice_mm]
+    uv, depth = [seeds.lattice_uv.reshape(-1, 2)], [lattice_mm]
     whole = _fits_16_bits(lattice_mm) and bool((lattice_mm % 1 == 0).all())
     made: list[Round] = []
-    for due in _shares(shots, rounds, len(even_uv)):
-        spent = sum(r.shots for r in made)
-        new_uv = even_uv if len(even_uv) and not made else plan.best(due - spent)
-        answer = np.asarray(measure(new_uv))
-        new_mm = answer.astype(np.float32)
-        new_mm[~(np.isfinite(new_mm) & (new_mm > 0))] = 0
+    for due in _shares(total, rounds, len(even_uv)):
+        left = due - sum(r.shots for r in made)
+        new_uv = even_uv if len(even_uv) and not made else plan.best(left)
+        new_uv = _allowed(new_uv, samples, left)
+        answer, new_mm = answers(measure, new_uv)
+        _refuse_metres(new_mm, samples)
         whole &= np.issubdtype(answer.dtype, np.integer) and _fits_16_bits(new_mm)
-        if new_mm.shape != (len(new_uv),):
-            raise ValueError(
-                f"the sensor was asked for {len(new_uv)} pixels and answered with shape"
-                f" {new_mm.shape}; it must return one depth per pixel"
-            )
         samples.add(new_uv, new_mm)
         uv.append(new_uv)
         depth.append(new_mm)
@@ -180,4 +209,29 @@ def acquire(
         np.repeat(np.arange(len(uv), dtype=np.uint8), counts),
         seeds.frame_shape,
         tuple(made),
+        plan if isinstance(plan, SurfacePlan) else None,
     )
+
+
+def _allowed(uv: npt.ArrayLike, samples: Samples, left: int) -> npt.NDArray[np.int32]:
+    """What a plan asks for, if it may: pixels of the frame, each for the first time, no more."""
+    pixels = pixels_in(uv, samples.frame_shape, "the plan's pixels")
+    places = pixels[:, 1].astype(np.int64) * samples.frame_shape[1] + pixels[:, 0]
+    if len(pixels) > left or samples.image_mm.ravel()[places].any():
+        raise ValueError(
+            f"the selector's plan asks for {len(pixels)} pixels where {left} are left, or for some"
+            " that are measured already"
+        )
+    if len(np.unique(places)) < len(places):
+        raise ValueError("the selector's plan asks for a pixel twice in one round")
+    return pixels
+
+
+def _refuse_metres(new_mm: npt.NDArray[np.float32], samples: Samples) -> None:
+    """A sensor that answers a hundredth of all that was measured so far means something else."""
+    farthest, nearest = float(new_mm.max(initial=0)), float(samples.low_mm.min())
+    if 0 < farthest < nearest / 100 < np.inf:
+        raise ValueError(
+            f"the sensor answers {farthest:g} mm at most, but nothing nearer than {nearest:g} mm"
+            " was measured so far; are these metres? Answer in millimetres, as the seeds are"
+        )

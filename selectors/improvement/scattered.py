@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import checked_map, sample_pairs
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_over
 from selective_depth.selectors.improvement.systems import (
     MAX_SAMPLES,
@@ -50,10 +51,10 @@ class ImprovementMap:
 
 
 def improvement_scattered(
-    uv: npt.NDArray[np.integer],
-    depth_mm: npt.NDArray[np.generic],
+    uv: npt.ArrayLike,
+    depth_mm: npt.ArrayLike,
     shape: tuple[int, int],
-    where: npt.NDArray[np.bool_] | None = None,
+    where: npt.ArrayLike | None = None,
     *,
     lattice: tuple[int, int] | None = None,
     exponent: float = EXPONENT,
@@ -66,7 +67,7 @@ def improvement_scattered(
     uv : int array of shape (n, 2)
         Pixels of the samples, column first. Of several at one pixel the last counts.
     depth_mm : array of shape (n,)
-        Their depths in millimetres; 0, negative or not finite = no measurement.
+        Their depths in millimetres; what is no depth (see `measured_mm`) is no measurement.
     shape : tuple of int
         Height and width of the frame.
     where : bool array of shape `shape`, optional
@@ -84,29 +85,22 @@ def improvement_scattered(
     ValueError
         If a sample lies outside the frame or an array's shape is wrong.
     """
-    height, width = shape
-    if uv.ndim != 2 or uv.shape[1] != 2 or depth_mm.shape != (len(uv),):
-        raise ValueError(
-            f"uv must have shape (n, 2) and depth_mm (n,), got {uv.shape} and {depth_mm.shape}"
-        )
-    if len(uv) and not (uv.min() >= 0 and uv[:, 0].max() < width and uv[:, 1].max() < height):
-        raise ValueError(f"a sample lies outside the frame of {width}x{height} pixels")
-    if where is not None and where.shape != shape:
-        raise ValueError(f"where must have the frame's shape {shape}, got {where.shape}")
+    pixels, mm = sample_pairs(uv, depth_mm, shape)
     measured = np.zeros(shape, np.float32)
-    depth = np.asarray(depth_mm, np.float32)
-    measured[uv[:, 1], uv[:, 0]] = np.where(np.isfinite(depth) & (depth > 0), depth, 0)
-    asked = np.ones(shape, np.bool_) if where is None else np.ascontiguousarray(where, np.bool_)
-    over = lattice or (min(128, height), min(128, width))
-    return _map(measured, asked, windows_over(shape, over, exponent), threads)
+    measured[pixels[:, 1], pixels[:, 0]] = mm
+    over = lattice or (min(128, shape[0]), min(128, shape[1]))
+    asked = None if where is None else checked_map(where, shape, "where") > 0
+    return map_scattered(measured, asked, windows_over(shape, over, exponent), threads)
 
 
-def _map(
+def map_scattered(
     measured: npt.NDArray[np.float32],
-    asked: npt.NDArray[np.bool_],
+    asked: npt.NDArray[np.bool_] | None,
     windows: Windows,
     threads: int | None,
 ) -> ImprovementMap:
+    """Map the improvement of an image of samples (mm, 0 = none) at the pixels asked for, or all."""
+    asked = np.ones(measured.shape, np.bool_) if asked is None else asked
     rows, columns = windows.rows, windows.columns
     result = ImprovementMap(
         estimate_mm=np.full(measured.shape, np.nan, np.float32),

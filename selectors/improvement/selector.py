@@ -15,15 +15,21 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.selectors.improvement.lattice import lattice_scratch
-from selective_depth.selectors.improvement.map import LEVELS, best_threshold, improvement_rows
+from selective_depth.selectors.improvement.map import (
+    LEVEL_SHIFT,
+    LEVELS,
+    best_threshold,
+    improvement_rows,
+)
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_of
-from selective_depth.selectors.improvement.scattered import EXPONENT
+from selective_depth.selectors.improvement.scattered import EXPONENT, map_scattered
 from selective_depth.selectors.improvement.systems import (
     aligned_zeros,
     sample_buffers,
     window_scratch,
 )
 from selective_depth.selectors.parallel import in_bands
+from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.selection import Selection
 
@@ -56,6 +62,11 @@ class ImprovementSelection(Selection):
     known: BoolMap
     raw: FloatMap
 
+    @property
+    def worth(self) -> FloatMap:
+        """What shots are chosen by: `raw`."""
+        return self.raw
+
 
 class ImprovementSelector:
     """Selects where a measurement would most improve the model of the scene.
@@ -75,6 +86,8 @@ class ImprovementSelector:
         If `share` or `exponent` is out of its range.
     """
 
+    name = "improvement"
+
     def __init__(
         self, share: float = 0.10, exponent: float = EXPONENT, threads: int | None = None
     ) -> None:
@@ -89,8 +102,18 @@ class ImprovementSelector:
         self.exponent = exponent
         self.threads = threads
 
-    def select(self, seeds: SeedGrid) -> ImprovementSelection:
-        """Map the improvement over the whole frame and select its best pixels."""
+    def select(self, samples: SeedGrid | Samples) -> ImprovementSelection:
+        """Map the improvement over the whole frame and select its best pixels.
+
+        Parameters
+        ----------
+        samples : SeedGrid or Samples
+            The seeds alone, which take the quick way, or all samples so far
+            (`improvement_scattered`, with windows about the seeds).
+        """
+        if isinstance(samples, Samples):
+            return self._select_scattered(samples)
+        seeds = samples
         windows = windows_of(seeds, self.exponent)
         shape = seeds.frame_shape
         # One block: the allocator keeps it for the next frame instead of returning its pages.
@@ -117,10 +140,27 @@ class ImprovementSelector:
         return ImprovementSelection(
             mask=raw >= threshold,
             score=score,
-            name="improvement",
+            name=self.name,
             estimate_mm=estimate,
             variance_mm2=variance,
             known=known,
+            raw=raw,
+        )
+
+    def _select_scattered(self, samples: Samples) -> ImprovementSelection:
+        windows = windows_of(samples.seeds, self.exponent)
+        found = map_scattered(np.maximum(samples.image_mm, 0), None, windows, self.threads)
+        raw = found.raw
+        wanted = int(self.share * np.count_nonzero(found.known))
+        half = np.float32(HALF_SCORE * samples.depth_mm.mean() if len(samples.uv) else 1.0)
+        levels = np.bincount(raw.view(np.uint32).ravel() >> LEVEL_SHIFT, minlength=LEVELS)
+        return ImprovementSelection(
+            mask=raw >= best_threshold(raw.ravel(), levels, wanted),
+            score=raw / (raw + half),
+            name=self.name,
+            estimate_mm=found.estimate_mm,
+            variance_mm2=found.variance_mm2,
+            known=found.known,
             raw=raw,
         )
 

@@ -7,11 +7,16 @@ from selective_depth.selectors.neural_gas.regions import (
     RegionSelection,
     delaunay_regions,
 )
-from selective_depth.selectors.neural_gas.selector import NeuralGasSelector, node_pixels
+from selective_depth.selectors.neural_gas.selector import (
+    LongEdgeSelector,
+    NeuralGasSelector,
+    node_pixels,
+)
 
 __all__ = [
     "BatchNeuralGas",
     "EdgeMetric",
+    "LongEdgeSelector",
     "NeuralGasSelector",
     "RegionSelection",
     "delaunay_regions",

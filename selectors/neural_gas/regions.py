@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.even import even_rank, spread
 from selective_depth.selectors.selection import Selection
 from selective_depth.selectors.triangulation import Mesh
 
@@ -49,7 +50,12 @@ class RegionSelection(Selection):
         The long-edge complement: pixels of triangles that do not survive. The project's own
         read-out, not the paper's; with 3-D edges it holds the depth steps.
     quantisation_error_mm : float
-        Mean distance of the seeds to their nearest node; NaN without seeds.
+        Mean distance of the samples to the node that serves each; NaN without samples. After
+        `exact` training that is the nearest node of all, after batch training the nearest of
+        those in the image around the sample: the same on surfaces, but more where depth has no
+        structure and the nearest in space lies elsewhere in the image.
+    drawn_uv : float32 array of shape (N, 2)
+        `nodes_uv` rounded as they were triangulated and drawn.
     """
 
     nodes_mm: npt.NDArray[np.float32]
@@ -61,6 +67,34 @@ class RegionSelection(Selection):
     edge_metric: str
     complement: npt.NDArray[np.bool_]
     quantisation_error_mm: float
+    drawn_uv: npt.NDArray[np.float32]
+
+    @property
+    def worth(self) -> npt.NDArray[np.float32]:
+        """What shots are chosen by: they fill the surviving triangles evenly, then the rest."""
+        return spread(self.mask)
+
+    def long_edges(self) -> Selection:
+        """The second read-out: the complement, ranked by the longest edge of each triangle.
+
+        Returns
+        -------
+        Selection
+            Its mask is `complement`; its score the longest edge of a pixel's triangle over the
+            longest of all, of which an even fill takes a tenth off, so that shots into one
+            triangle do not clump.
+        """
+        long = np.flatnonzero(~self.kept)
+        score = np.zeros(self.mask.shape, np.float32)
+        if len(long):
+            longest = self.edge_lengths[long].max(axis=1)
+            longest /= longest.max()
+            state = np.zeros(self.mask.shape, np.uint8)
+            states = np.full(len(long), _LONG, np.uint8)
+            uv = self.drawn_uv.astype(np.float64)
+            _rasterise(uv, self.triangles[long], states, longest, state, score)
+            score *= 1 - np.float32(0.1) * even_rank(score.shape)
+        return Selection(self.complement, score, "neural gas, long edges")
 
     @cached_property
     def edges_kept(self) -> npt.NDArray[np.int32]:
@@ -147,6 +181,8 @@ def delaunay_regions(
         edge_metric=edge_metric,
         complement=state == _LONG,
         quantisation_error_mm=quantisation_error_mm,
+        drawn_uv=drawn_uv,
+        crowded=1.0,
     )
 
 

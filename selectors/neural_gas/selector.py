@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -15,7 +17,9 @@ from selective_depth.selectors.neural_gas.regions import (
     RegionSelection,
     delaunay_regions,
 )
+from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.selection import Selection
 
 Algorithm = Literal["exact", "fast"]
 
@@ -24,7 +28,8 @@ class NeuralGasSelector:
     """Select regions by neural gas.
 
     `select` trains from nothing; `update` goes on from the last frame's nodes, whichever of the
-    two has made them, as a live loop wants it (scikit-learn's `fit` and `partial_fit`).
+    two has made them, as a live loop wants it (scikit-learn's `fit` and `partial_fit`). Several
+    threads may `select` with one selector; of `update`, each stream of frames needs its own.
 
     Parameters
     ----------
@@ -96,96 +101,133 @@ class NeuralGasSelector:
         self.factor = factor
         self.threads = threads
         self._live = BatchNeuralGas(nodes, seed, threads)
+        self._updating = threading.Lock()
 
-    def select(self, seeds: SeedGrid) -> RegionSelection:
-        """Train from nothing on the seeds of one frame.
+    def select(self, samples: SeedGrid | Samples) -> RegionSelection:
+        """Train from nothing on the samples of one frame.
 
         Raises
         ------
         ValueError
-            If a seed that returned depth has no finite metric point.
+            If a sample that returned depth has no finite metric point, or the samples have neither
+            a camera nor metric points.
         """
-        points = _finite_points(seeds)
+        points, uv = _finite_points(samples), samples.uv
+        gas = BatchNeuralGas(self.nodes, self.seed, self.threads)
         if len(points) == 0:
-            return self._nothing(seeds)
+            return self._nothing(samples)
         if self.algorithm == "fast":
-            self._live.train(points, seeds.uv)
+            gas.train(points, uv)
         else:
             nodes_mm = train_exact(points, self.nodes, self.epochs, self.seed)
-            self._live.adopt(nodes_mm, node_pixels(nodes_mm, seeds), points)
-        return self._regions(seeds)
+            gas.adopt(nodes_mm, node_pixels(nodes_mm, samples), points)
+        regions = self._regions(gas, samples)
+        self._live = gas
+        return regions
 
-    def update(self, seeds: SeedGrid) -> RegionSelection:
+    def update(self, samples: SeedGrid | Samples) -> RegionSelection:
         """Go on from the nodes of the last frame, by batch passes; without one, train cold by them.
 
         Raises
         ------
         ValueError
-            If a seed that returned depth has no finite metric point.
+            If a sample that returned depth has no finite metric point, or the samples have neither
+            a camera nor metric points.
+        RuntimeError
+            If another thread is updating the same nodes.
         """
-        points = _finite_points(seeds)
+        points, uv = _finite_points(samples), samples.uv
         if len(points) == 0:
-            return self._nothing(seeds)
-        self._live.update(points, seeds.uv)
-        return self._regions(seeds)
+            return self._nothing(samples)
+        if not self._updating.acquire(blocking=False):
+            raise RuntimeError(
+                "another thread is updating this NeuralGasSelector; give each stream of frames a"
+                " selector of its own"
+            )
+        try:
+            gas = self._live.update(points, uv)
+            return self._regions(gas, samples)
+        finally:
+            self._updating.release()
 
-    def _regions(self, seeds: SeedGrid) -> RegionSelection:
-        gas, camera = self._live, seeds.camera
+    def _regions(self, gas: BatchNeuralGas, samples: SeedGrid | Samples) -> RegionSelection:
+        camera = samples.camera
         nodes_mm = gas.nodes_mm_[gas.won_]
         return delaunay_regions(
             nodes_mm,
             gas.nodes_uv_[gas.won_] if camera is None else camera.project_uv(nodes_mm),
-            seeds.frame_shape,
+            samples.frame_shape,
             edge_metric=self.edge_metric,
             factor=self.factor,
             quantisation_error_mm=gas.quantisation_error_mm_,
         )
 
-    def _nothing(self, seeds: SeedGrid) -> RegionSelection:
+    def _nothing(self, samples: SeedGrid | Samples) -> RegionSelection:
         return delaunay_regions(
             np.zeros((0, 3), np.float32),
             np.zeros((0, 2), np.float32),
-            seeds.frame_shape,
+            samples.frame_shape,
             edge_metric=self.edge_metric,
             factor=self.factor,
         )
 
 
-def node_pixels(nodes_mm: npt.NDArray[np.float32], seeds: SeedGrid) -> npt.NDArray[np.float32]:
+@dataclass(frozen=True)
+class LongEdgeSelector:
+    """Select by the long-edge complement of a neural gas: the project's own read-out.
+
+    Parameters
+    ----------
+    gas : NeuralGasSelector, optional
+        Trains the nodes; its selection's `RegionSelection.long_edges` is read.
+    """
+
+    gas: NeuralGasSelector = field(default_factory=NeuralGasSelector)
+    name = "neural gas, long edges"
+
+    def select(self, samples: SeedGrid | Samples) -> Selection:
+        """Train from nothing, and rank the triangles that do not survive by their longest edge."""
+        return self.gas.select(samples).long_edges()
+
+
+def node_pixels(
+    nodes_mm: npt.NDArray[np.float32], samples: SeedGrid | Samples
+) -> npt.NDArray[np.float32]:
     """Pixels (column, row) on which nodes fall.
 
     Parameters
     ----------
     nodes_mm : float32 array of shape (N, 3)
         Nodes in millimetres.
-    seeds : SeedGrid
-        The seeds they were trained on. With a camera the nodes are projected; without one, each
-        takes the mean pixel of the four seeds nearest to it, the nearer the heavier.
+    samples : SeedGrid or Samples
+        What they were trained on. With a camera the nodes are projected; without one, each
+        takes the mean pixel of the four samples nearest to it, the nearer the heavier.
 
     Returns
     -------
     float32 array of shape (N, 2)
     """
-    if seeds.camera is not None:
-        return seeds.camera.project_uv(nodes_mm)
-    near = min(4, len(seeds.uv))
-    distance, index = cKDTree(seeds.points_mm).query(nodes_mm, k=[*range(1, near + 1)])
-    uv = seeds.uv[index]
+    if samples.camera is not None:
+        return samples.camera.project_uv(nodes_mm)
+    points_mm = samples.points_mm
+    near = min(4, len(points_mm))
+    distance, index = cKDTree(points_mm).query(nodes_mm, k=[*range(1, near + 1)])
+    uv = samples.uv[index]
     weight = 1 / (distance + 1e-3)
     # Neighbours in space may lie at both ends of a panorama's rows: no mean over the seam.
-    weight[np.abs(uv[..., 0] - uv[:, :1, 0]) > seeds.frame_shape[1] / 4] = 0
+    weight[np.abs(uv[..., 0] - uv[:, :1, 0]) > samples.frame_shape[1] / 4] = 0
     mean: npt.NDArray[np.float64] = (uv * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[
         :, None
     ]
     return mean.astype(np.float32)
 
 
-def _finite_points(seeds: SeedGrid) -> npt.NDArray[np.float32]:
-    points = seeds.points_mm
+def _finite_points(samples: SeedGrid | Samples) -> npt.NDArray[np.float32]:
+    points = samples.points_mm
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points).all(axis=1)).sum())
         raise ValueError(
-            f"{bad} of {len(points)} seeds have depth but no finite metric point; set their depth"
+            f"{bad} of {len(points)} samples have depth but no finite metric point; set their depth"
             " to 0 (no measurement) or give finite points"
         )
     return points

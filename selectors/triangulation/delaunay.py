@@ -242,7 +242,12 @@ class Mesh:
     triangles: int
 
     @classmethod
-    def of(cls, uv: npt.NDArray[np.integer], capacity: int = 0) -> Mesh | None:
+    def of(
+        cls,
+        uv: npt.NDArray[np.integer],
+        capacity: int = 0,
+        extent_px: tuple[int, int] | None = None,
+    ) -> Mesh | None:
         """Triangulate points, all different and not negative; None if they lie on one line.
 
         Parameters
@@ -251,6 +256,9 @@ class Mesh:
             Pixels, column first.
         capacity : int, optional
             Number of points to leave room for; at least n is taken.
+        extent_px : tuple of int, optional
+            Height and width within which all points lie, those to be added too; by default that
+            of the points given.
         """
         n = len(uv)
         if n < 3:
@@ -260,7 +268,7 @@ class Mesh:
         points[:n] = uv
         size = 2 * capacity
         tri, adj = np.empty((size, 3), np.int32), np.empty((size, 3), np.int32)
-        extent_u, extent_v = (int(points[:n, i].max()) + 1 for i in (0, 1))
+        extent_v, extent_u = extent_px or (int(points[:n, i].max()) + 1 for i in (1, 0))
         # Four points a bin, on average: sparse points leave bins of 8 pixels empty.
         bin_px = max(_BIN_PX, math.isqrt(4 * extent_u * extent_v // n))
         side_u, side_v = (extent_u - 1) // bin_px + 1, (extent_v - 1) // bin_px + 1

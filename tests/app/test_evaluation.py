@@ -17,7 +17,7 @@ from selective_depth.app.commands.model import save_cloud, save_depth, save_mode
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, MISUSED, OK
 from selective_depth.app.evaluation import evaluate as protocol
-from selective_depth.app.evaluation.evaluate import Errors, Outcome, errors_of, outcomes, summarise
+from selective_depth.app.evaluation.evaluate import Errors, Outcome, outcomes, summarise
 from selective_depth.app.evaluation.report import comparison, print_results, to_markdown
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case
 from selective_depth.app.pictures import palette
@@ -87,16 +87,6 @@ def test_no_strategy_but_the_oracle_sees_what_it_does_not_measure(name: str) -> 
     changed = DepthFrame(other, 0, 0, truth.camera)
     second = STRATEGIES[name].pixels(Case(changed, SHAPE, SHOTS, 3, 0))
     np.testing.assert_array_equal(first, second)
-
-
-def test_errors_are_those_of_the_definition() -> None:
-    depth = np.array([[1000, 3000, 0, 1000]], np.uint16)
-    seen = DepthFrame(depth, 0, 0, Camera.kinect(4, 1))
-    model = np.array([[1019.0, 3061.0, 5.0, 1021.0]], np.float32)
-    rmse_mm, mae_mm, wrong = errors_of(model, seen)
-    assert rmse_mm == pytest.approx(np.sqrt((19**2 + 61**2 + 21**2) / 3))
-    assert mae_mm == pytest.approx((19 + 61 + 21) / 3)
-    assert wrong == pytest.approx(2 / 3)  # 19 mm is right; 61 mm > 2 %; 21 mm > 20 mm
 
 
 def test_what_returned_nothing_is_counted_among_all_measurements() -> None:

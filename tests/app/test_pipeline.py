@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -156,22 +155,6 @@ def test_a_lost_ctrl_c_ends_the_run_before_the_next_frame(monkeypatch: pytest.Mo
     code, session = run(monkeypatch, source)
     assert code == 130
     assert session.report.frames <= 3
-
-
-@pytest.mark.parametrize("window", [False, True])
-def test_a_picture_is_written_where_no_window_showed_the_run(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, window: bool
-) -> None:
-    class Shown(Viewer):
-        def __init__(self, *arguments: Any, **options: Any) -> None:
-            super().__init__(*arguments, **options)
-            self.window = window
-
-    monkeypatch.setattr(session_module, "Viewer", Shown)
-    viewer = ViewerOptions(headless=True, save=tmp_path / "out.rrd")
-    run(monkeypatch, Script([0, 1]), dataclasses.replace(SMALL, viewer=viewer))
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"out.rrd", "out.toml"} | ({"out.png"} if not window else set())
 
 
 def test_live_goes_on_through_stall_and_loss(monkeypatch: pytest.MonkeyPatch) -> None:

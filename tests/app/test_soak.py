@@ -105,7 +105,7 @@ class Watched(DepthSource):
 @pytest.fixture(scope="module")
 def desk_mm() -> npt.NDArray[np.uint16]:
     """The frames of the bundled recording."""
-    with open_source(str(ROOT / "recordings" / "workstation")) as source:
+    with open_source(str(ROOT / "recordings" / "workstation.oni")) as source:
         return np.stack([frame.depth_mm for frame in source])
 
 

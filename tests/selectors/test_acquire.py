@@ -11,11 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from selective_depth.selectors.acquire import Plan, Score, StepScore, acquire, shots_of
-from selective_depth.selectors.acquire.choice import CROWDED, choose
+from selective_depth.selectors.acquire import StepSelector, SurfaceSelector, acquire, shots_of
+from selective_depth.selectors.choice import CROWDED, choose
+from selective_depth.selectors.even import EvenSelector
+from selective_depth.selectors.improvement import ImprovementSelector
+from selective_depth.selectors.neural_gas import LongEdgeSelector, NeuralGasSelector
+from selective_depth.selectors.quality import errors_of
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.samples import MISSED, Samples
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.selection import Selection, Selector, Worth, plan_of
 
 Depth = npt.NDArray[np.uint16]
 
@@ -50,12 +55,33 @@ class Sensor:
         return self.depth_mm[uv[:, 1], uv[:, 0]]
 
 
+def gradient(samples: Samples) -> npt.NDArray[np.floating]:
+    """A selector of one's own: the slope of the model so far, the more the wider the gap."""
+    model = reconstruct(samples.uv, samples.depth_mm, samples.frame_shape)
+    return np.hypot(*np.gradient(model)) * np.minimum(samples.gap_px(), 4)
+
+
+ALL: dict[str, Selector | Worth] = {
+    "surface": SurfaceSelector(),
+    "step": StepSelector(),
+    "improvement": ImprovementSelector(),
+    "neural gas": NeuralGasSelector(nodes=150),
+    "long edges": LongEdgeSelector(NeuralGasSelector(nodes=150)),
+    "even": EvenSelector(),
+    "a function": gradient,
+}
+every_selector = pytest.mark.parametrize("selector", ALL.values(), ids=ALL)
+
+
+@every_selector
 @pytest.mark.parametrize("rounds", [1, 3, 8])
-def test_only_the_chosen_pixels_are_measured_once_and_within_the_budget(rounds: int) -> None:
+def test_only_the_chosen_pixels_are_measured_once_and_within_the_budget(
+    rounds: int, selector: Selector | Worth
+) -> None:
     depth = scene(0)
     seeds = SeedGrid.from_array(depth, (24, 26))
     sensor = Sensor(depth)
-    acquisition = acquire(sensor, seeds, 0.05, rounds)
+    acquisition = acquire(sensor, seeds, 0.05, rounds, selector)
     shots = round(0.05 * depth.size)
     assert len(sensor.asked) == shots
     assert len(set(sensor.asked)) == len(sensor.asked), "a pixel was measured twice"
@@ -73,25 +99,29 @@ def test_only_the_chosen_pixels_are_measured_once_and_within_the_budget(rounds: 
     )
 
 
+@every_selector
 @pytest.mark.parametrize("rounds", [1, 4])
-def test_what_is_not_measured_has_no_say(rounds: int) -> None:
+def test_what_is_not_measured_has_no_say(rounds: int, selector: Selector | Worth) -> None:
     """Change every pixel that was not asked for: nothing else may be asked for."""
     depth = scene(1)
     seeds = SeedGrid.from_array(depth, (24, 26))
-    first = acquire(Sensor(depth), seeds, 0.06, rounds)
+    first = acquire(Sensor(depth), seeds, 0.06, rounds, selector)
     known = np.zeros(depth.shape, np.bool_)
     known[first.uv[:, 1], first.uv[:, 0]] = True
     other = np.where(known, depth, scene(2))
     assert (other != depth).sum() > depth.size // 2
-    second = acquire(Sensor(other), SeedGrid.from_array(other, (24, 26)), 0.06, rounds)
+    second = acquire(Sensor(other), SeedGrid.from_array(other, (24, 26)), 0.06, rounds, selector)
     np.testing.assert_array_equal(first.uv, second.uv)
 
 
-def test_a_later_round_may_only_use_what_earlier_rounds_returned() -> None:
+@every_selector
+def test_a_later_round_may_only_use_what_earlier_rounds_returned(
+    selector: Selector | Worth,
+) -> None:
     """Replace the returns of the last round: all rounds up to it choose the same."""
     depth = scene(3)
     seeds = SeedGrid.from_array(depth, (24, 26))
-    first = acquire(Sensor(depth), seeds, 0.06, 4)
+    first = acquire(Sensor(depth), seeds, 0.06, 4, selector)
     calls = 0
 
     def lying(uv: npt.NDArray[np.int32]) -> Depth:
@@ -100,13 +130,13 @@ def test_a_later_round_may_only_use_what_earlier_rounds_returned() -> None:
         answer = depth[uv[:, 1], uv[:, 0]]
         return answer if calls < 3 else np.full_like(answer, 1234)
 
-    second = acquire(lying, seeds, 0.06, 4)
+    second = acquire(lying, seeds, 0.06, 4, selector)
     early = first.round <= 3
     np.testing.assert_array_equal(first.uv[early], second.uv[second.round <= 3])
-    assert not np.array_equal(first.uv, second.uv)
+    assert np.array_equal(first.uv, second.uv) == isinstance(selector, EvenSelector)
 
 
-def score_reference(samples: Samples, rule: StepScore) -> npt.NDArray[np.float64]:
+def score_reference(samples: Samples, rule: StepSelector) -> npt.NDArray[np.float64]:
     """The step score by its formula, pixel by pixel."""
     samples_mm = samples.image_mm
     vote_sq = samples.vote_px**2
@@ -154,8 +184,8 @@ def test_the_score_is_its_formula(
     samples = Samples((height, width), pitch_px)
     v, u = np.nonzero(shot)
     samples.add(np.stack((u, v), axis=-1).astype(np.int32), depth[shot])
-    rule = StepScore()
-    score = rule.map(samples)
+    rule = StepSelector()
+    score = rule.select(samples).score
     assert np.isfinite(score).all() and (score >= 0).all()
     assert (score[shot] == 0).all()
     expected = score_reference(samples, rule)
@@ -166,15 +196,15 @@ def test_the_score_is_its_formula(
     agree = np.isclose(score, expected, rtol=1e-3, atol=1e-3)
     assert agree.mean() > 0.5 or density < 0.01
     np.testing.assert_array_equal(score > 0, expected > 0)
-    np.testing.assert_array_equal(score, rule.map(samples, threads=1))
+    np.testing.assert_array_equal(score, StepSelector(threads=1).select(samples).score)
 
 
 def last_vote_is_tied(samples: Samples, voters: int) -> npt.NDArray[np.bool_]:
     """Pixels with two samples equally near for the last vote: either may have it."""
     v, u = np.nonzero(samples.image_mm > 0)
     if len(v) <= voters:
-        return np.zeros(samples.shape, np.bool_)
-    rows, columns = np.indices(samples.shape)
+        return np.zeros(samples.frame_shape, np.bool_)
+    rows, columns = np.indices(samples.frame_shape)
     squared = np.sort((rows[..., None] - v) ** 2 + (columns[..., None] - u) ** 2)
     return np.asarray(squared[..., voters - 1] == squared[..., voters])
 
@@ -182,7 +212,7 @@ def last_vote_is_tied(samples: Samples, voters: int) -> npt.NDArray[np.bool_]:
 @settings(max_examples=25, deadline=None)
 @given(
     st.builds(
-        StepScore,
+        StepSelector,
         voters=st.integers(2, 6),  # of one, the second distance is open
         falloff=st.sampled_from([1.0, 2.0, 4.0, 5.0]),
         gap=st.sampled_from([0.3, 0.8, 2.0]),
@@ -190,7 +220,7 @@ def last_vote_is_tied(samples: Samples, voters: int) -> npt.NDArray[np.bool_]:
     ),
     st.integers(0, 2**32 - 1),
 )
-def test_the_score_heeds_its_parameters(rule: StepScore, seed: int) -> None:
+def test_the_score_heeds_its_parameters(rule: StepSelector, seed: int) -> None:
     rng = np.random.default_rng(seed)
     shot = rng.random((24, 50)) < 0.04
     depth = np.where(rng.random(shot.shape) < 0.2, 0, rng.integers(1000, 1500, shot.shape))
@@ -199,7 +229,9 @@ def test_the_score_heeds_its_parameters(rule: StepScore, seed: int) -> None:
     clear = ~last_vote_is_tied(samples, rule.voters)
     assert clear.any()
     expected = score_reference(samples, rule)
-    np.testing.assert_allclose(rule.map(samples)[clear], expected[clear], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(
+        rule.select(samples).score[clear], expected[clear], rtol=1e-3, atol=1e-3
+    )
 
 
 @pytest.mark.parametrize("voters", [2, 4, 5])
@@ -210,8 +242,8 @@ def test_no_score_in_a_tile_is_above_its_bound(voters: int) -> None:
     depth = rng.choice([1000, 2000], shot.shape)
     samples = Samples(shot.shape)
     samples.add(np.argwhere(shot)[:, ::-1].astype(np.int32), depth[shot])
-    rule = StepScore(voters=voters)
-    score, bound = rule.map(samples), rule._bounds(samples)
+    rule = StepSelector(voters=voters)
+    score, bound = rule.select(samples).score, rule._bounds(samples)
     for row, column in np.ndindex(bound.shape):
         top, left = row * samples.tile_px, column * samples.tile_px
         tile = score[top : top + samples.tile_px, left : left + samples.tile_px]
@@ -219,19 +251,22 @@ def test_no_score_in_a_tile_is_above_its_bound(voters: int) -> None:
 
 
 def test_the_score_is_its_formula_where_no_two_samples_are_equally_near() -> None:
-    rule = StepScore()
+    rule = StepSelector()
     samples = Samples((20, 20))
     uv = np.array([(10, 10), (13, 10), (9, 5), (3, 11), (16, 17), (12, 2)], np.int32)
     samples.add(uv, np.array([1000, 2000, 0, 1100, 0, 1050]))
     expected = score_reference(samples, rule)
-    np.testing.assert_allclose(rule.map(samples), expected, rtol=2e-5, atol=1e-3)
+    np.testing.assert_allclose(rule.select(samples).score, expected, rtol=2e-5, atol=1e-3)
 
 
-class Plainly(Score):
-    """The step score without its shortcuts."""
+class Plainly:
+    """A score without its shortcuts: the whole map anew in every round."""
 
-    def map(self, samples: Samples, threads: int | None = None) -> npt.NDArray[np.float32]:
-        return StepScore().map(samples, threads)
+    def __init__(self, rule: StepSelector | SurfaceSelector) -> None:
+        self._rule = rule
+
+    def select(self, samples: SeedGrid | Samples) -> Selection:
+        return self._rule.select(samples)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -239,12 +274,52 @@ class Plainly(Score):
 def test_skipping_tiles_changes_no_choice(seed: int, budget: float, rounds: int) -> None:
     depth = scene(seed, 101, 143)
     seeds = SeedGrid.from_array(depth, (25, 29))
-    quick = acquire(Sensor(depth), seeds, budget, rounds)
-    plain = acquire(Sensor(depth), seeds, budget, rounds, Plainly())
+    quick = acquire(Sensor(depth), seeds, budget, rounds, StepSelector())
+    plain = acquire(Sensor(depth), seeds, budget, rounds, Plainly(StepSelector()))
     np.testing.assert_array_equal(quick.uv, plain.uv)
-    np.testing.assert_array_equal(
-        quick.uv, acquire(Sensor(depth), seeds, budget, rounds, threads=1).uv
-    )
+    one = acquire(Sensor(depth), seeds, budget, rounds, StepSelector(threads=1))
+    np.testing.assert_array_equal(quick.uv, one.uv)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("budget", "rounds"), [(0.02, 5), (0.10, 8), (0.6, 2)])
+def test_the_kept_model_is_as_good_as_one_made_anew(seed: int, budget: float, rounds: int) -> None:
+    """But for the ties of four samples on a circle, whose triangles depend on the order."""
+    depth = scene(seed, 101, 143)
+    seeds = SeedGrid.from_array(depth, (25, 29))
+    kept = acquire(Sensor(depth), seeds, budget, rounds)
+    anew = acquire(Sensor(depth), seeds, budget, rounds, Plainly(SurfaceSelector()))
+    errors = [errors_of(each.reconstruct(), depth).rmse_mm for each in (kept, anew)]
+    assert errors[0] == pytest.approx(errors[1], rel=0.1)
+    one = acquire(Sensor(depth), seeds, budget, rounds, threads=1)
+    np.testing.assert_array_equal(kept.uv, one.uv)
+    again = reconstruct(kept.uv, kept.depth_mm, depth.shape)
+    assert (np.abs(kept.reconstruct() - again) > 1).mean() < 0.03
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_scored_again_is_what_the_whole_map_would_say(seed: int) -> None:
+    """The same model, every pixel scored by the formula, spelled out."""
+    depth = scene(seed, 101, 143)
+    samples = Samples.of(SeedGrid.from_array(depth, (25, 29)))
+    plan = SurfaceSelector().plan(samples)
+    for _ in range(4):
+        uv = plan.best(150)
+        samples.add(uv, depth[uv[:, 1], uv[:, 0]])
+    plan.look()
+    layers = plan._surface.layers
+    down, along = np.gradient(layers.depth_mm.astype(float))
+    slope = np.maximum(np.hypot(down, along), 1e-3)
+    rows, columns = np.indices(depth.shape)
+    missed = np.argwhere(samples.image_mm < 0)
+    miss_sq = np.full(depth.shape, 1e9)
+    for v, u in missed:
+        miss_sq = np.minimum(miss_sq, (rows - v) ** 2 + (columns - u) ** 2)
+    gap_sq = samples.gap_px().astype(float) ** 2
+    spread = np.sqrt(layers.spread_mm2 + 25.0)
+    expected = slope * np.sqrt(gap_sq) * np.sqrt(spread) / (1 + (gap_sq / miss_sq) ** 2)
+    expected[~samples.open()] = 0
+    np.testing.assert_allclose(plan.score, expected, rtol=2e-3, atol=1e-6)
 
 
 def choose_reference(score: npt.NDArray[np.float32], shots: int) -> list[float]:
@@ -324,10 +399,17 @@ def test_a_step_is_found_to_the_pixel() -> None:
 def test_budget_is_a_share_or_a_number() -> None:
     assert shots_of(0.05, (480, 640)) == 15360
     assert shots_of(7, (480, 640)) == 7
-    assert shots_of(1, (480, 640)) == 1
     assert shots_of(1.0, (10, 10)) == 100
+    with pytest.raises(ValueError, match=r"give shots=1 or budget=1\.0"):
+        shots_of(1, (480, 640))
+    depth = scene(0)
+    one = acquire(Sensor(depth), SeedGrid.from_array(depth, (24, 26)), shots=1)
+    assert sum(r.shots for r in one.rounds) == 1
+    for wrong in (-1, depth.size + 1):
+        with pytest.raises(ValueError, match=f"shots is {wrong}; give between 0 and"):
+            acquire(Sensor(depth), SeedGrid.from_array(depth, (8, 8)), shots=wrong)
     for wrong in (-0.1, 1.5, 101, float("nan")):
-        with pytest.raises(ValueError, match=r"give a share from 0\.0 to 1\.0, or a whole number"):
+        with pytest.raises(ValueError, match=r"give a share from 0\.0 to 1\.0, or shots as"):
             shots_of(wrong, (10, 10))
 
 
@@ -337,7 +419,7 @@ def test_misuse_is_refused_in_a_sentence() -> None:
         acquire(Sensor(scene(0)), seeds, 0.1, 0)
     for voters in (0, 1, 7):
         with pytest.raises(ValueError, match=f"voters is {voters}; give between 2 and 6"):
-            StepScore(voters=voters)
+            StepSelector(voters=voters)
     with pytest.raises(ValueError, match="must return one depth per pixel"):
         acquire(lambda uv: np.zeros(3), seeds, 100, 1)
 
@@ -356,27 +438,80 @@ def test_the_record_of_rounds() -> None:
 
 def test_samples_book_what_returned_and_what_did_not() -> None:
     samples = Samples((25, 70))
-    samples.stale[:] = False
+    samples.add(np.array([(35, 12)]), np.array([1000]))
     samples.add(np.array([(69, 24), (3, 2)], np.int32), np.array([1500, 0]))
     assert samples.image_mm[24, 69] == 1500 and samples.image_mm[2, 3] == MISSED
     assert samples.low_mm[2, 7] == samples.high_mm[2, 7] == 1500
     assert samples.low_mm[0, 0] > samples.high_mm[0, 0], "a miss has no depth"
-    assert samples.stale[1:, 6:].all() and samples.stale[:2, :2].all()
-    assert samples.stale.sum() == 8
+    assert samples.additions == 2
+    late = samples.changed == 2
+    assert late[1:, 6:].all() and late[:2, :2].all()
+    assert late.sum() == 8
     assert samples.bits[24, 2] == np.uint64(1) << np.uint64(5)
 
 
 def test_a_score_of_ones_own() -> None:
-    class TopLeft(Score):
-        def map(self, samples: Samples, threads: int | None = None) -> npt.NDArray[np.float32]:
-            rows, columns = np.indices(samples.shape)
-            return np.where(samples.image_mm == 0, 1000 - rows - columns, 0).astype(np.float32)
+    def top_left(samples: Samples) -> npt.NDArray[np.int64]:
+        rows, columns = np.indices(samples.frame_shape)
+        return 1000 - rows - columns
 
-    assert isinstance(TopLeft().plan(Samples((5, 5))), Plan)
-    depth = scene(0)
-    acquisition = acquire(Sensor(depth), SeedGrid.from_array(depth, (8, 8)), 20, 2, TopLeft())
+    depth = np.full((96, 128), 2000, np.uint16)
+    acquisition = acquire(Sensor(depth), SeedGrid.from_array(depth, (24, 26)), 20, 2, top_left)
     taken = acquisition.uv[acquisition.round > 0]
     assert len(taken) == 20
+    assert taken.sum(axis=1).max() < 12, "the corner is filled before all else"
+
+
+@pytest.mark.parametrize("wrong", [StepSelector, "step", np.zeros((9, 9))])
+def test_what_is_no_selector_is_refused(wrong: object) -> None:
+    with pytest.raises(TypeError, match=r"give an object with select\(samples\)"):
+        plan_of(wrong, Samples((9, 9)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((3, 3)), "nothing", None, np.zeros((96, 128), complex)])
+def test_a_function_must_answer_for_every_pixel(wrong: object) -> None:
+    depth = scene(0)
+    with pytest.raises(ValueError, match="must be a number for every pixel, of shape"):
+        acquire(
+            Sensor(depth), SeedGrid.from_array(depth, (8, 8)), shots=9, selector=lambda _: wrong
+        )
+
+
+def test_two_plans_on_the_same_samples_know_of_each_other() -> None:
+    """Neither asks for what the other has measured, nor scores it by what was known before."""
+    depth = scene(0)
+    samples = Samples.of(SeedGrid.from_array(depth, (24, 26)))
+    one, other = StepSelector().plan(samples), StepSelector().plan(samples)
+    for _ in range(3):
+        for plan in (one, other):
+            uv = plan.best(60)
+            assert (samples.image_mm[uv[:, 1], uv[:, 0]] == 0).all(), "measured already"
+            np.testing.assert_array_equal(uv, StepSelector().plan(samples).best(60))
+            samples.add(uv, depth[uv[:, 1], uv[:, 0]])
+
+
+def test_a_plan_may_not_ask_twice_nor_for_too_much() -> None:
+    depth = scene(0)
+
+    class Stubborn(EvenSelector):
+        def __init__(self, pixels: list[tuple[int, int]]) -> None:
+            self.pixels = pixels
+
+        def plan(self, samples: Samples) -> Stubborn:
+            return self
+
+        def best(self, shots: int) -> npt.NDArray[np.int32]:
+            return np.array(self.pixels, np.int32)
+
+    seeds = SeedGrid.from_array(depth, (24, 26))
+    for pixels, words in (
+        ([(1, 1), (1, 1)], "a pixel twice"),
+        ([(1, 1), (3, 1), (5, 1)], "3 pixels where 2 are left"),
+        ([seeds.lattice_uv[0, 0]], "measured already"),
+        ([(1, 127)], "the row seems to come first"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            acquire(Sensor(depth), seeds, shots=2, rounds=1, selector=Stubborn(pixels))
 
 
 @pytest.mark.parametrize(("folder", "index"), [("livingroom", 0), ("tabletop", 3)])

@@ -298,9 +298,9 @@ def test_wrong_input_is_named():
         ImprovementSelector(exponent=2)
     with pytest.raises(ValueError, match="outside the frame of 128x96"):
         improvement_scattered(np.array([[128, 0]]), np.array([1000]), SHAPE)
-    with pytest.raises(ValueError, match="uv must have shape"):
+    with pytest.raises(ValueError, match="uv must be whole numbers of shape"):
         improvement_scattered(np.zeros((2, 3), int), np.zeros(2), SHAPE)
-    with pytest.raises(ValueError, match="where must have"):
+    with pytest.raises(ValueError, match="where must be a number for every pixel"):
         improvement_scattered(np.zeros((0, 2), int), np.zeros(0), SHAPE, np.ones((2, 2), bool))
 
 

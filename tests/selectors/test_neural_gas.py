@@ -461,7 +461,7 @@ def test_nan_is_refused_with_a_sentence(algorithm):
     seeds = SeedGrid.from_array(np.ones((48, 64)), (8, 8), points_mm=points)
     seeds.lattice_points_mm[2, 3] = np.nan
     selector = NeuralGasSelector(10, 2, "exact" if algorithm == "exact" else "fast")
-    with pytest.raises(ValueError, match=r"1 of 64 seeds have depth but no finite metric point"):
+    with pytest.raises(ValueError, match=r"1 of 64 samples have depth but no finite metric point"):
         (selector.update if algorithm == "update" else selector.select)(seeds)
 
 

@@ -9,15 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from selective_depth.selectors.reconstruct import (
-    BRIDGE_PX,
-    STEP_MM,
-    nearest_sample,
-    reconstruct,
-    samples_image,
-)
+from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.triangulation import BRIDGE_PX, STEP_MM, nearest_sample
 from selective_depth.selectors.triangulation.delaunay import GHOST, Mesh
+from selective_depth.selectors.triangulation.nearest import FAR_SQ
 
 Pixels = npt.NDArray[np.int32]
 
@@ -89,7 +85,7 @@ def test_adding_points_gives_what_all_at_once_gives(case: tuple[tuple[int, int],
 
 
 def test_a_lattice_is_triangulated_without_slivers_or_gaps() -> None:
-    seeds = SeedGrid.from_array(np.ones((480, 640)), (128, 128))
+    seeds = SeedGrid.from_array(np.full((480, 640), 1000), (128, 128))
     uv = seeds.lattice_uv.reshape(-1, 2)
     mesh = Mesh.of(uv)
     assert mesh is not None
@@ -113,16 +109,19 @@ def test_nearest_sample_is_exact(case: tuple[tuple[int, int], Pixels]) -> None:
     shape, uv = case
     valid = np.zeros(shape, np.bool_)
     valid[uv[:, 1], uv[:, 0]] = True
-    found = nearest_sample(valid)
-    assert valid[found[..., 1], found[..., 0]].all()
+    nearest, gap_sq = nearest_sample(valid)
+    assert valid.ravel()[nearest].all()
     rows, columns = np.indices(shape)
-    distance = (found[..., 0] - columns) ** 2 + (found[..., 1] - rows) ** 2
+    distance = (nearest % shape[1] - columns) ** 2 + (nearest // shape[1] - rows) ** 2
     np.testing.assert_array_equal(distance, nearest_reference(valid))
-    np.testing.assert_array_equal(found, nearest_sample(valid, threads=1))
+    np.testing.assert_array_equal(gap_sq, distance)
+    np.testing.assert_array_equal(nearest, nearest_sample(valid, threads=1)[0])
 
 
 def test_nearest_sample_of_nothing_says_so() -> None:
-    assert (nearest_sample(np.zeros((3, 4), np.bool_)) == -1).all()
+    nearest, gap_sq = nearest_sample(np.zeros((3, 4), np.bool_))
+    assert (nearest == -1).all()
+    assert (gap_sq == FAR_SQ).all()
 
 
 def candidates(
@@ -204,7 +203,6 @@ def test_shots_that_missed_and_bad_values_are_left_out() -> None:
 def test_what_is_no_depth_is_no_sample(value: float) -> None:
     uv = np.array([(1, 1), (5, 1), (1, 5)], np.int32)
     depth = np.array([800, 900, value])
-    assert samples_image(uv, depth, (7, 7))[5, 1] == 0
     np.testing.assert_array_equal(
         reconstruct(uv, depth, (7, 7)), reconstruct(uv[:2], depth[:2], (7, 7))
     )
@@ -253,5 +251,5 @@ def test_what_does_not_fit_is_refused_in_a_sentence() -> None:
     with pytest.raises(ValueError, match=r"column first.*\(3, 2\) and \(2,\)"):
         reconstruct(np.zeros((3, 2), int), np.zeros(2), (4, 4))
     for outside in ((4, 0), (0, 3), (-1, 0), (0, -1)):
-        with pytest.raises(ValueError, match="outside the image of 4x3 pixels"):
+        with pytest.raises(ValueError, match="outside the frame of 4x3 pixels"):
             reconstruct(np.array([outside]), np.array([1000]), (3, 4))

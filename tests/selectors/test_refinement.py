@@ -7,10 +7,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from selective_depth.selectors.acquire import Plan, StepScore, acquire
+from selective_depth.selectors.acquire import StepSelector, acquire
 from selective_depth.selectors.acquire.refinement import COARSE_PX, HOLE_STEPS, SHARE, finer_lattice
 from selective_depth.selectors.samples import Samples, seed_pitch_px
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.selection import Plan
 
 
 def flat(lattice: tuple[int, int], shape: tuple[int, int] = (120, 160)) -> SeedGrid:
@@ -77,10 +78,10 @@ def test_the_last_row_and_column_are_reached() -> None:
 
 
 def test_distances_are_judged_by_the_finer_lattice() -> None:
-    class Spy(StepScore):
-        def plan(self, samples: Samples, threads: int | None = None) -> Plan:
+    class Spy(StepSelector):
+        def plan(self, samples: Samples) -> Plan:
             pitches_px.append(samples.pitch_px)
-            return super().plan(samples, threads)
+            return super().plan(samples)
 
     pitches_px: list[float] = []
     seeds = flat((12, 16))

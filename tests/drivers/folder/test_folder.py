@@ -26,7 +26,9 @@ from selective_depth.drivers.folder import FolderWriter, RecordedFolder, write_f
 from selective_depth.drivers.folder.images import read_png
 from selective_depth.drivers.folder.sidecar import SIDECAR, Sidecar, read_sidecar, write_sidecar
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.oni import write_oni
 from selective_depth.drivers.open import open_source
+from selective_depth.drivers.realtime import RealtimeSource
 
 Depth = npt.NDArray[np.uint16]
 
@@ -57,7 +59,9 @@ def test_plain_folder_is_read_in_natural_order_with_a_kinects_camera(tmp_path: P
         assert folder.camera == Camera.kinect()
         assert folder.fps == 30.0
         frames = list(folder)
-    assert [Path(frame.source).name for frame in frames] == ["2.png", "9.png", "10.png"]
+    assert {frame.source for frame in frames} == {str(tmp_path)}
+    for number, frame in zip((2, 9, 10), frames, strict=True):
+        np.testing.assert_array_equal(frame.depth_mm, _depth(480, 640, seed=number))
     assert [frame.index for frame in frames] == [0, 1, 2]
     assert [frame.timestamp_us for frame in frames] == [0, 33333, 66667]
     for frame, number in zip(frames, (2, 9, 10), strict=True):
@@ -69,7 +73,7 @@ def test_tum_folder_uses_its_list_scale_and_sequence(tmp_path: Path, inner: str)
     root = tmp_path / "rgbd_dataset_freiburg2_desk"
     raw = np.array([[0, 5000, 65535, 12]] * 3, np.uint16)
     raw = np.tile(raw, (160, 160))
-    _png(root / "depth" / "1311.1.png", raw)
+    _png(root / "depth" / "1311.1.png", np.zeros_like(raw))
     _png(root / "depth" / "1311.3.png", raw)
     _png(root / "depth" / "not-listed.png", _depth())
     (root / "depth.txt").write_text(
@@ -81,7 +85,8 @@ def test_tum_folder_uses_its_list_scale_and_sequence(tmp_path: Path, inner: str)
         assert (folder.camera.fx, folder.camera.cy) == (520.9, 249.7)
         assert folder.fps == 10.0
         first, second = folder
-    assert first.source.endswith("1311.3.png")
+    assert first.depth_mm.any()
+    assert not second.depth_mm.any()
     assert [first.timestamp_us, second.timestamp_us] == [1_311_300_000, 1_311_400_000]
     np.testing.assert_array_equal(first.depth_mm[0, :4], [0, 1000, 13107, 2])
 
@@ -140,7 +145,7 @@ def test_real_frames_come_out_as_they_are_in_the_files(shared_data: Path) -> Non
         assert folder.frame_count == len(files) == 120
         count = 0
         for frame, file in zip(folder, files, strict=True):
-            assert frame.source == str(file)
+            assert frame.source == str(shared_data / "sequence")
             if count % 10 == 0:
                 expected = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
                 np.testing.assert_array_equal(frame.depth_mm, expected)
@@ -391,7 +396,7 @@ def test_a_wrong_line_of_a_tum_list_is_shown(tmp_path: Path, line: str) -> None:
         ("[camera]\nwidth = 8", "camera.*a table of exactly width"),
         (
             "[camera]\nwidth = 8\nheight = 6\nfx = 0\nfy = 1\ncx = 1\ncy = 1",
-            "camera.*both must be positive",
+            "camera.*focal length fx is 0",
         ),
         (
             "[camera]\nwidth = 8.5\nheight = 6\nfx = 1\nfy = 1\ncx = 1\ncy = 1",
@@ -517,3 +522,80 @@ def _with_right_checksums(data: bytearray) -> bytearray:
         data[end - 4 : end] = zlib.crc32(data[at + 4 : end - 4]).to_bytes(4, "big")
         at = end
     return data
+
+
+# What other people's public reports showed
+
+
+def test_names_that_are_decimals_come_in_the_order_of_the_numbers(tmp_path: Path) -> None:
+    names = ["1700000000.0625", "1700000000.125", "1700000000.5", "1700000001.0", "1700000001.25"]
+    for number, name in enumerate(names, start=1):
+        _png(tmp_path / f"{name}.png", np.full((6, 8), number, np.uint16))
+    with RecordedFolder(tmp_path) as folder:
+        assert [int(frame.depth_mm[0, 0]) for frame in folder] == [1, 2, 3, 4, 5]
+        assert "leading zeros" in folder.notes[0]
+
+
+def test_names_whose_two_readings_agree_are_no_matter(tmp_path: Path) -> None:
+    for name in ("1.250", "1.750", "2.125"):
+        _png(tmp_path / f"{name}.png", _depth(6, 8))
+    with RecordedFolder(tmp_path) as folder:
+        assert folder.notes == ()
+
+
+@pytest.mark.parametrize("name", ["out.oni", "out"])
+def test_a_clock_that_wraps_is_named_and_leaves_nothing_in_the_way(
+    tmp_path: Path, name: str
+) -> None:
+    times_us = [4294917295, 4294950628, 16666]
+    frames = [
+        DepthFrame(_depth(6, 8), index, time_us, Camera.kinect(8, 6))
+        for index, time_us in enumerate(times_us)
+    ]
+    write_folder(tmp_path / "wrapped", frames)
+    out = tmp_path / name
+    if name == "out":  # a folder can hold them
+        with open_source(tmp_path / "wrapped") as source:
+            assert write_folder(out, source) == 3
+        return
+    for _ in range(2):
+        with (
+            open_source(tmp_path / "wrapped") as source,
+            pytest.raises(ValueError, match=r"frame 2 of .*wrapped round.*timestamps_us"),
+        ):
+            write_oni(out, source)
+        assert not out.exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are forked on POSIX only")
+@pytest.mark.parametrize("kind", ["folder", "oni", "realtime"])
+def test_a_forked_process_is_told_to_open_the_source_itself(tmp_path: Path, kind: str) -> None:
+    frames = [DepthFrame(_depth(6, 8), k, 33_333 * k, Camera.kinect(8, 6)) for k in range(4)]
+    path = tmp_path / ("walk.oni" if kind == "oni" else "walk")
+    _ = write_oni(path, frames) if kind == "oni" else write_folder(path, frames)
+    with open_source(path) as opened:
+        source = RealtimeSource(opened) if kind == "realtime" else opened
+        source.read()
+        child = os.fork()
+        if child == 0:
+            try:
+                source.read(timeout_s=2)
+            except SourceError as error:
+                os._exit(0 if "open it in the process" in str(error) else 1)
+            os._exit(2)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        assert source.read().index == 1
+        source.close()
+
+
+def test_a_disk_that_fills_leaves_nothing_in_the_way(small_disk: Path) -> None:
+    """The real thing: a file system of one megabyte."""
+    noise = np.random.default_rng(0).integers(1, 20_000, (480, 640)).astype(np.uint16)
+    frames = [DepthFrame(noise, k, 33_333 * k, Camera.kinect()) for k in range(9)]
+    for _ in range(2):
+        with pytest.raises(OutputError, match="No space left"):
+            write_folder(small_disk / "out", frames)
+        with pytest.raises(OutputError, match="No space left"):
+            write_oni(small_disk / "out.oni", frames)
+        assert list(small_disk.iterdir()) == []
+    assert write_folder(small_disk / "out", frames[:1]) == 1

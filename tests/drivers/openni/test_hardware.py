@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selective_depth.drivers.openni import OpenNIDevice, OpenNIRecording, list_devices, record
+from selective_depth.drivers.oni import OniReader
+from selective_depth.drivers.openni import OpenNIDevice, list_devices, record
 
 pytestmark = pytest.mark.hardware
 
@@ -29,5 +30,5 @@ def test_three_hundred_frames() -> None:
 def test_a_recording_holds_what_was_seen(tmp_path: Path) -> None:
     report = record(tmp_path / "out.oni", frames=60)
     assert (report.ended, report.problem) == ("done", "")
-    with OpenNIRecording(report.path) as recording:
+    with OniReader(report.path) as recording:
         assert len(list(recording)) == report.frames >= 60

@@ -21,8 +21,8 @@ from selective_depth.drivers.errors import (
     SourceError,
     SourceNotFoundError,
 )
-from selective_depth.drivers.oni import inspect_oni
-from selective_depth.drivers.openni import OpenNIRecording, record
+from selective_depth.drivers.oni import OniReader, inspect_oni
+from selective_depth.drivers.openni import record
 
 pytestmark = pytest.mark.openni
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.openni
 def images(path: Path) -> list[int]:
     """Which of the sensor's images a recording holds, in order; each must be whole."""
     found = []
-    with OpenNIRecording(path) as recording:
+    with OniReader(path) as recording:
         for frame in recording:
             right = int(frame.depth_mm[0, -1])
             assert np.all(frame.depth_mm[:, :320] == right + 1000)
@@ -69,7 +69,7 @@ def test_frames_whose_last_pixel_differs_replay_bit_for_bit(
     virtual_sensor.set(frames=images_file, limit=8)
     report = record(tmp_path / "out.oni", frames=8)
     assert (report.frames, report.problem) == (8, "")
-    with OpenNIRecording(report.path) as recording:
+    with OniReader(report.path) as recording:
         for index, frame in enumerate(recording):
             np.testing.assert_array_equal(frame.depth_mm, frames[index % 4])
 

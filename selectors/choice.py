@@ -1,4 +1,7 @@
-"""Which pixels to measure, given what each is worth: the best, but not in clumps."""
+"""Which pixels to measure, given what each is worth: the best, but not in clumps.
+
+Any score will do, of any selector or of one's own: `choose` turns it into pixels.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import checked_map
 from selective_depth.selectors.parallel import in_bands
 
 CROWDED = 0.3
@@ -119,20 +123,53 @@ def best_pixels(
 
 
 def choose(
-    score: npt.NDArray[np.float32],
+    score: npt.ArrayLike,
     shots: int,
     *,
     crowded: float = CROWDED,
     threads: int | None = None,
 ) -> npt.NDArray[np.int32]:
-    """The pixels of a whole map that are worth most (see `best_pixels`)."""
-    count = -(-score.shape[0] // _TILE_PX) * -(-score.shape[1] // _TILE_PX)
+    """The pixels of a map that are worth most.
+
+    Parameters
+    ----------
+    score : array of shape (H, W)
+        Worth of a shot at each pixel; where it is 0, negative, NaN or masked, none is made.
+    shots : int
+        How many pixels at most.
+    crowded : float, default `CROWDED`
+        Factor on pixels with a better one among their eight neighbours.
+    threads : int, optional
+        Kernel threads; default `default_threads()`.
+
+    Returns
+    -------
+    int32 array of shape (n, 2)
+        Column first, row by row of the image; n <= shots. Of equals, some from everywhere.
+
+    Raises
+    ------
+    ValueError
+        If the score is no image of numbers or `shots` is negative.
+
+    Examples
+    --------
+    >>> choose([[0, 5, 0], [0, 0, 0], [2, 0, 1]], 2)
+    array([[1, 0],
+           [0, 2]], dtype=int32)
+    """
+    if np.ndim(score) != 2:
+        raise ValueError(f"score must have shape (height, width), got {np.shape(score)}")
+    if shots < 0:
+        raise ValueError(f"shots is {shots}; give 0 or more")
+    worth = checked_map(score, np.shape(score), "score")
+    count = -(-worth.shape[0] // _TILE_PX) * -(-worth.shape[1] // _TILE_PX)
     tiles = np.arange(count)
     # Most pixels are out of the question: a sample of them says where to draw a safe line.
-    some = score.ravel()[::_SAMPLED]
+    some = worth.ravel()[::_SAMPLED]
     rank = 4 * shots // _SAMPLED
     least = float(np.partition(some, len(some) - rank)[-rank]) if 0 < rank < len(some) else 0.0
-    uv, _ = best_pixels(score, tiles, shots, least, _TILE_PX, threads, crowded)
+    uv, _ = best_pixels(worth, tiles, shots, least, _TILE_PX, threads, crowded)
     if len(uv) < shots and least > 0:
-        uv, _ = best_pixels(score, tiles, shots, 0.0, _TILE_PX, threads, crowded)
+        uv, _ = best_pixels(worth, tiles, shots, 0.0, _TILE_PX, threads, crowded)
     return uv

@@ -10,7 +10,6 @@ share of the neighbours that did.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -18,9 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
-from selective_depth.selectors.acquire.choice import best_pixels, choose
+from selective_depth.selectors.choice import best_pixels
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import Samples
+from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.selection import Plan, Selection
 
 Image = npt.NDArray[np.float32]
 Number = float | np.float32
@@ -46,40 +47,6 @@ _DE_BRUIJN = np.uint64(0x03F79D71B4CB0A89)
 _BIT_OF = np.zeros(64, np.int64)
 for _bit in range(64):
     _BIT_OF[((1 << _bit) * int(_DE_BRUIJN) & (2**64 - 1)) >> 58] = _bit
-
-
-class Plan(ABC):
-    """An acquisition under way: says, round after round, which pixels to measure next."""
-
-    @abstractmethod
-    def best(self, shots: int) -> npt.NDArray[np.int32]:
-        """At most so many pixels, shape (n, 2), column first, from the samples as they are."""
-
-
-class Score(ABC):
-    """What a measurement is worth at each pixel, from the samples alone."""
-
-    name: str = "score"
-
-    @abstractmethod
-    def map(self, samples: Samples, threads: int | None = None) -> Image:
-        """Worth of a shot at every pixel, float32 (H, W); 0 where none should be made."""
-
-    def plan(self, samples: Samples, threads: int | None = None) -> Plan:
-        """Begin an acquisition that adds its measurements to `samples`."""
-        return _MapPlan(self, samples, threads)
-
-
-@dataclass(frozen=True, eq=False)
-class _MapPlan(Plan):
-    """The plain way: the whole map anew in every round."""
-
-    score: Score
-    samples: Samples
-    threads: int | None
-
-    def best(self, shots: int) -> npt.NDArray[np.int32]:
-        return choose(self.score.map(self.samples, self.threads), shots)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -319,7 +286,7 @@ def _tables(falloff: float, vote_px: int) -> tuple[Image, Image, npt.NDArray[np.
 
 
 @dataclass(frozen=True)
-class StepScore(Score):
+class StepSelector:
     """The project's own score: expected squared error, times how far a shot reaches.
 
     ``sqrt(P(return)) * (sum_k w_k (z_k - mean)^2 / sum_k w_k + noise^2) * gap`` over the nearest
@@ -332,39 +299,47 @@ class StepScore(Score):
     Parameters
     ----------
     voters : int, default 5
-        How many samples vote, 2 to 6. 4 see a step too late; 8, tried before, blurred it.
+        How many samples vote, 2 to 6.
     falloff : float, default 4
-        How fast a vote fades with distance. 3 is better in one shot and 5 in a closed loop: the
-        slower it fades, the wider the band about a strong step that is shot all over before a
-        weaker one is looked at.
+        How fast a vote fades with distance: the slower, the wider the band about a strong step
+        that is shot all over before a weaker one is looked at.
     gap : float, default 0.8
         Distance, in steps of the seed lattice, beyond which being farther from the samples
         counts no more (4 pixels for 128x128 seeds on 640x480).
     noise_mm : float, default 1
         Error expected even where all neighbours agree; it spends what is left of a budget on
         the widest gaps.
+    threads : int, optional
+        Kernel threads; default `default_threads()`. The result does not depend on it.
+
+    Raises
+    ------
+    ValueError
+        If `voters` is out of its range.
     """
 
     voters: int = 5
     falloff: float = 4.0
     gap: float = 0.8
     noise_mm: float = 1.0
+    threads: int | None = None
     name = "step score"
 
     def __post_init__(self) -> None:
         if not 2 <= self.voters <= _SLOTS:  # the gap is told by two
             raise ValueError(f"voters is {self.voters}; give between 2 and {_SLOTS}")
 
-    def map(self, samples: Samples, threads: int | None = None) -> Image:
-        """Score of every pixel (see `Score.map`)."""
-        score = np.empty(samples.shape, np.float32)
-        most = np.empty(samples.stale.shape, np.float32)
-        self._score(samples, np.arange(samples.stale.size), 0.0, score, most, threads)
-        return score
+    def select(self, samples: SeedGrid | Samples) -> Selection:
+        """Score every pixel, in mm^2 times pixels; the mask is the best tenth of them."""
+        known = Samples.of(samples)
+        score = np.empty(known.frame_shape, np.float32)
+        most = np.empty(known.changed.shape, np.float32)
+        self._score(known, np.arange(known.changed.size), 0.0, score, most)
+        return Selection.of_score(score, self.name)
 
-    def plan(self, samples: Samples, threads: int | None = None) -> Plan:
+    def plan(self, samples: Samples) -> Plan:
         """Begin an acquisition; same choice as by the whole map, at a fraction of the work."""
-        return _StepPlan(self, samples, threads)
+        return _StepPlan(self, samples)
 
     def _score(
         self,
@@ -373,7 +348,6 @@ class StepScore(Score):
         least: float,
         score: Image,
         most: Image,
-        threads: int | None,
     ) -> None:
         weight_of, length_of, half_of = _tables(self.falloff, samples.vote_px)
         dealt = np.concatenate([tiles[hand::_BANDS] for hand in range(_BANDS)])
@@ -398,7 +372,7 @@ class StepScore(Score):
                 end,
             ),
             len(dealt),
-            threads,
+            self.threads,
         )
 
     def _bounds(self, samples: Samples) -> Image:
@@ -415,22 +389,24 @@ class _StepPlan(Plan):
     those that the whole map would give.
     """
 
-    def __init__(self, score: StepScore, samples: Samples, threads: int | None) -> None:
-        self._rule = score
+    def __init__(self, rule: StepSelector, samples: Samples) -> None:
+        self._rule = rule
         self._samples = samples
-        self._threads = threads
-        self._map = np.zeros(samples.shape, np.float32)
-        self._most = np.zeros(samples.stale.shape, np.float32)  # best score in each tile
+        self._map = np.zeros(samples.frame_shape, np.float32)
+        tiles = samples.changed.shape
+        self._most = np.zeros(tiles, np.float32)  # best score in each tile
         # Scores of a tile are true from this one on; lower ones may be missing.
-        self._floor = np.full(samples.stale.shape, np.inf, np.float32)
+        self._floor = np.full(tiles, np.inf, np.float32)
+        self._seen = samples.additions
 
     def best(self, shots: int) -> npt.NDArray[np.int32]:
+        """The `shots` pixels that are worth most, from the samples as they are now."""
         samples = self._samples
-        outdated = samples.stale & (self._floor < np.inf)
+        outdated = (samples.changed > self._seen) & (self._floor < np.inf)
         _clear_tiles(self._map, np.flatnonzero(outdated), samples.tile_px)
         self._floor[outdated] = np.inf
         self._most[outdated] = 0
-        samples.stale[:] = False
+        self._seen = samples.additions
         bound = self._rule._bounds(samples)
         least = self._first_line(bound, shots)
         while True:
@@ -453,11 +429,11 @@ class _StepPlan(Plan):
         """Make the scores of some tiles true from `least` on."""
         due = wanted & (self._floor > least)
         tiles = np.flatnonzero(due)
-        self._rule._score(self._samples, tiles, least, self._map, self._most, self._threads)
+        self._rule._score(self._samples, tiles, least, self._map, self._most)
         self._floor[due] = least
 
     def _best(
         self, tiles: npt.NDArray[np.int64], shots: int, least: float
     ) -> tuple[npt.NDArray[np.int32], np.float32]:
         tile_px = self._samples.tile_px
-        return best_pixels(self._map, tiles, shots, least, tile_px, self._threads)
+        return best_pixels(self._map, tiles, shots, least, tile_px, self._rule.threads)

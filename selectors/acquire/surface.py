@@ -1,0 +1,177 @@
+"""Where the kept model is likely to be wrong: the default score of unmeasured pixels.
+
+A model that is linear between samples errs where a depth step runs through a triangle, and how much
+can be read off the model itself: its slope times the distance to the nearest sample is how far the
+depth goes from there to the pixel, and the spread of the corners of the pixel's triangle is what
+there is to go. A shot beside one that missed is likely to miss. Their product is the score. It
+needs nothing but the model of the samples so far, which is kept while they come: a round costs what
+it adds, and after the last one the model is there.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.choice import best_pixels
+from selective_depth.selectors.parallel import in_bands
+from selective_depth.selectors.samples import Samples
+from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.selection import Selection
+from selective_depth.selectors.triangulation import FAR_SQ, TILE_PX, Layers, Surface
+
+Float32Array = npt.NDArray[np.float32]
+
+_FLAT = np.float32(1e-3)
+"""Slope where the model has none, mm per pixel: what is left of a budget spreads by it."""
+
+
+@njit(cache=True, nogil=True)
+def _note_misses(
+    uv: npt.NDArray[np.int32],
+    depth_mm: Float32Array,
+    radius: int,
+    miss_sq: npt.NDArray[np.int32],
+    touched: npt.NDArray[np.bool_],
+) -> None:
+    """Lower the squared distance to the nearest miss within a radius of each, and book it."""
+    height, width = miss_sq.shape
+    for i in range(len(uv)):
+        if depth_mm[i] > 0:
+            continue
+        u0, v0 = uv[i, 0], uv[i, 1]
+        top, bottom = max(v0 - radius, 0), min(v0 + radius, height - 1)
+        left, right = max(u0 - radius, 0), min(u0 + radius, width - 1)
+        for v in range(top, bottom + 1):
+            for u in range(left, right + 1):
+                miss_sq[v, u] = min(miss_sq[v, u], (u - u0) ** 2 + (v - v0) ** 2)
+        touched[top // TILE_PX : bottom // TILE_PX + 1, left // TILE_PX : right // TILE_PX + 1] = (
+            True
+        )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _score_tiles(
+    tiles: npt.NDArray[np.int64],
+    layers: Layers,
+    image_mm: Float32Array,
+    miss_sq: npt.NDArray[np.int32],
+    reach_sq: float,
+    noise_mm2: float,
+    score: Float32Array,
+) -> None:
+    """Score the pixels of some tiles, numbered row by row; `image_mm` is that of the samples."""
+    height, width = score.shape
+    columns = layers.touched.shape[1]
+    depth = layers.depth_mm
+    for tile in tiles:
+        top, left = tile // columns * TILE_PX, tile % columns * TILE_PX
+        for v in range(top, min(top + TILE_PX, height)):
+            above, below = max(v - 1, 0), min(v + 1, height - 1)
+            for u in range(left, min(left + TILE_PX, width)):
+                gap_sq = layers.gap_sq[v, u]
+                if image_mm[v, u] != 0 or gap_sq > reach_sq:
+                    score[v, u] = 0
+                    continue
+                before, after = max(u - 1, 0), min(u + 1, width - 1)
+                along = (depth[v, after] - depth[v, before]) / np.float32(max(after - before, 1))
+                down = (depth[below, u] - depth[above, u]) / np.float32(max(below - above, 1))
+                slope = max(np.sqrt(along * along + down * down), _FLAT)
+                rise_mm = slope * np.sqrt(np.float32(gap_sq))
+                spread_mm = np.sqrt(layers.spread_mm2[v, u] + np.float32(noise_mm2))
+                nearness = np.float32(gap_sq) / np.float32(miss_sq[v, u])
+                returning = np.float32(1) / (np.float32(1) + nearness * nearness)
+                score[v, u] = rise_mm * np.sqrt(spread_mm) * returning
+
+
+@dataclass(frozen=True)
+class SurfaceSelector:
+    """Expected error of the kept model: ``rise * sqrt(spread) * P(return)``.
+
+    `rise` is the slope of the model (central differences) times the distance to the nearest return;
+    `spread` the standard deviation of the depths at the corners of the pixel's triangle, and noise;
+    ``P(return) = 1 / (1 + (g / m)^4)``, where `g` and `m` are the distances to the nearest return
+    and the nearest miss. The exponents were chosen on the `livingroom` and `tabletop` frames and
+    the virtual scenes; figures in ``app/docs/evaluation.md``.
+
+    Parameters
+    ----------
+    noise_mm : float, default 5
+        Error expected even where all neighbours agree.
+    threads : int, optional
+        Kernel threads; default `default_threads()`. The result does not depend on it.
+    """
+
+    noise_mm: float = 5.0
+    threads: int | None = None
+    name = "surface score"
+
+    def select(self, samples: SeedGrid | Samples) -> Selection:
+        """Score every pixel; the mask is the best tenth of them."""
+        plan = SurfacePlan(self, Samples.of(samples))
+        plan.look()
+        return Selection.of_score(plan.score, self.name)
+
+    def plan(self, samples: Samples) -> SurfacePlan:
+        """Begin an acquisition: the same choice as by the whole map, of which little is new."""
+        return SurfacePlan(self, samples)
+
+
+class SurfacePlan:
+    """An acquisition under way, with the model that its samples make.
+
+    Attributes
+    ----------
+    score : float32 array of shape (height, width)
+        Worth of a shot at each pixel, as of the last `look`.
+    """
+
+    def __init__(self, rule: SurfaceSelector, samples: Samples) -> None:
+        shape = samples.frame_shape
+        self._rule = rule
+        self._samples = samples
+        self._surface = Surface(shape, rule.threads)
+        self._miss_sq = np.full(shape, FAR_SQ, np.int32)
+        self._seen = 0
+        self.score = np.zeros(shape, np.float32)
+
+    def look(self) -> None:
+        """Take in what was measured since, and score again what that changes."""
+        samples, layers = self._samples, self._surface.layers
+        radius = math.ceil(2 * samples.reach_px)
+        for uv, depth_mm in samples.added_since(self._seen):
+            self._surface.add(uv, depth_mm)
+            _note_misses(uv, depth_mm, radius, self._miss_sq, layers.touched)
+        self._seen = samples.additions
+        tiles = np.flatnonzero(layers.touched)
+        layers.touched[:] = False
+
+        def band(first: int, end: int) -> None:
+            _score_tiles(
+                tiles[first:end],
+                layers,
+                samples.image_mm,
+                self._miss_sq,
+                float(samples.reach_px**2),
+                float(self._rule.noise_mm**2),
+                self.score,
+            )
+
+        in_bands(band, len(tiles), self._rule.threads)
+
+    def best(self, shots: int) -> npt.NDArray[np.int32]:
+        """The `shots` pixels that are worth most, from the samples as they are now."""
+        self.look()
+        tiles = np.arange(self._surface.layers.touched.size)
+        return best_pixels(self.score, tiles, shots, 0.0, TILE_PX, self._rule.threads)[0]
+
+    def model_mm(self) -> Float32Array:
+        """Dense depth of the samples as they are now, float32 (height, width); a copy."""
+        for uv, depth_mm in self._samples.added_since(self._seen):
+            self._surface.add(uv, depth_mm)
+        self._seen = self._samples.additions
+        return self._surface.layers.depth_mm.copy()

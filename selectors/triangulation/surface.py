@@ -1,0 +1,274 @@
+"""The dense model of the samples so far, kept while more come.
+
+A round of measurements touches a small part of a frame. So the triangulation, the nearest sample
+of every pixel and the model drawn from them are kept, and a batch of new samples costs what it
+changes: the triangles of the new points' stars are drawn again, and the pixels that lie nearest to
+a new sample are told so. The result is that of `selectors.reconstruct`, whatever the batches were.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.parallel import in_bands
+from selective_depth.selectors.triangulation.delaunay import GHOST, Mesh
+from selective_depth.selectors.triangulation.nearest import FAR_SQ, nearest_sample
+
+STEP_MM = 50.0
+"""Depth span of a triangle's vertices above which it may bridge a hole or a step, millimetres."""
+
+BRIDGE_PX = 10.0
+"""Edge length above which such a triangle does, pixels."""
+
+TILE_PX = 16
+"""Side of the square tiles in which changes are booked."""
+
+Float32Array = npt.NDArray[np.float32]
+Int32Array = npt.NDArray[np.int32]
+
+
+class Layers(NamedTuple):
+    """What is known at every pixel, arrays of shape (height, width).
+
+    `touched` alone has a value for every tile of `TILE_PX` pixels a side.
+
+    Attributes
+    ----------
+    samples_mm : float32 array
+        Depth of the sample on the pixel, 0 where none returned.
+    nearest : int32 array
+        Nearest sample, as ``row * width + column``; -1 where there is none at all.
+    gap_sq : int32 array
+        Squared distance to it in pixels.
+    depth_mm : float32 array
+        The model.
+    plain : bool array
+        Whether it is linear there, on a triangle that bridges nothing; elsewhere it is the depth of
+        the nearest sample.
+    spread_mm2 : float32 array
+        Variance of the depths at the corners of the pixel's triangle; 0 outside the hull.
+    touched : bool array of shape (rows, columns)
+        Tiles in which, or beside which, a pixel may have changed since the reader cleared it.
+    """
+
+    samples_mm: Float32Array
+    nearest: Int32Array
+    gap_sq: Int32Array
+    depth_mm: Float32Array
+    plain: npt.NDArray[np.bool_]
+    spread_mm2: Float32Array
+    touched: npt.NDArray[np.bool_]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _touch(touched: npt.NDArray[np.bool_], top: int, left: int, bottom: int, right: int) -> None:
+    """Book a change of pixels in these rows and columns, which their neighbours may heed."""
+    rows, columns = touched.shape
+    first_column, last_column = max(left - 1, 0) // TILE_PX, (right + 1) // TILE_PX
+    for row in range(max(top - 1, 0) // TILE_PX, min((bottom + 1) // TILE_PX, rows - 1) + 1):
+        for column in range(first_column, min(last_column, columns - 1) + 1):
+            touched[row, column] = True
+
+
+@njit(cache=True, nogil=True)
+def _claim(layers: Layers, uv: Int32Array) -> None:
+    """Give every new sample the pixels that lie nearer to it than to any other.
+
+    They form a convex region about the sample: in each row one run, which touches that of the
+    row before.
+    """
+    gap_sq = layers.gap_sq
+    height, width = gap_sq.shape
+    for i in range(len(uv)):
+        u0, v0 = uv[i, 0], uv[i, 1]
+        name = v0 * width + u0
+        z = layers.samples_mm[v0, u0]
+        for direction in (-1, 1):
+            left, right = u0, u0
+            v = v0 if direction < 0 else v0 + 1
+            while 0 <= v < height:
+                dv_sq = (v - v0) * (v - v0)
+                first, last = width, -1
+                u = max(left - 1, 0)
+                while u < width and u <= right + 1:
+                    if (u - u0) * (u - u0) + dv_sq < gap_sq[v, u]:
+                        first = min(first, u)
+                        last = u
+                    u += 1
+                if last < 0:
+                    break
+                while first > 0 and (first - 1 - u0) ** 2 + dv_sq < layers.gap_sq[v, first - 1]:
+                    first -= 1
+                while (
+                    last < width - 1 and (last + 1 - u0) ** 2 + dv_sq < layers.gap_sq[v, last + 1]
+                ):
+                    last += 1
+                for u in range(first, last + 1):
+                    gap_sq[v, u] = (u - u0) * (u - u0) + dv_sq
+                    layers.nearest[v, u] = name
+                    if not layers.plain[v, u]:
+                        layers.depth_mm[v, u] = z
+                _touch(layers.touched, v, first, v, last)
+                left, right = first, last
+                v += direction
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _bridges(
+    uv: Int32Array, z_mm: Float32Array, corners: Int32Array, step_mm: float, bridge_px: float
+) -> bool:
+    """Whether a triangle of three points spans a hole or a depth step."""
+    a, b, c = corners[0], corners[1], corners[2]
+    if max(z_mm[a], z_mm[b], z_mm[c]) - min(z_mm[a], z_mm[b], z_mm[c]) <= step_mm:
+        return False
+    longest = max(
+        (uv[a, 0] - uv[b, 0]) ** 2 + (uv[a, 1] - uv[b, 1]) ** 2,
+        (uv[b, 0] - uv[c, 0]) ** 2 + (uv[b, 1] - uv[c, 1]) ** 2,
+        (uv[c, 0] - uv[a, 0]) ** 2 + (uv[c, 1] - uv[a, 1]) ** 2,
+    )
+    return bool(longest > bridge_px * bridge_px)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw(
+    layers: Layers,
+    uv: Int32Array,
+    z_mm: Float32Array,
+    tri: Int32Array,
+    adj: Int32Array,
+    changed: Int32Array,
+    limits: tuple[float, float],
+) -> None:
+    """Draw triangles into the model: those that bridge nothing linearly, the others not at all.
+
+    Pixels on the edge that a bridge shares with a plain triangle are the plain one's, and a sample
+    counts as plain. So whichever triangle is drawn last, the model is the same.
+    """
+    width = layers.depth_mm.shape[1]
+    step_mm, bridge_px = limits
+    plain, owned = np.empty(3, np.bool_), np.empty(3, np.bool_)
+    for t in changed:
+        a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
+        u0, v0, u1, v1, u2, v2 = uv[a, 0], uv[a, 1], uv[b, 0], uv[b, 1], uv[c, 0], uv[c, 1]
+        z0, z1, z2 = z_mm[a], z_mm[b], z_mm[c]
+        mean = (z0 + z1 + z2) / np.float32(3)
+        spread = ((z0 - mean) ** 2 + (z1 - mean) ** 2 + (z2 - mean) ** 2) / np.float32(3)
+        bridge = _bridges(uv, z_mm, tri[t], step_mm, bridge_px)
+        for k in range(3):
+            o = tri[adj[t, k]]
+            hull = o[0] == GHOST or o[1] == GHOST or o[2] == GHOST
+            plain[k] = bridge and not hull and not _bridges(uv, z_mm, o, step_mm, bridge_px)
+            # Of two triangles, the edge's pixels are that one's which it bounds from above.
+            begin, end = tri[t, (k + 1) % 3], tri[t, (k + 2) % 3]
+            du, dv = uv[end, 0] - uv[begin, 0], uv[end, 1] - uv[begin, 1]
+            owned[k] = hull or dv > 0 or (dv == 0 and du > 0)
+        area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)  # positive: they run anticlockwise
+        left, right, top, bottom = (
+            min(u0, u1, u2),
+            max(u0, u1, u2),
+            min(v0, v1, v2),
+            max(v0, v1, v2),
+        )
+        _touch(layers.touched, top, left, bottom, right)
+        for v in range(top, bottom + 1):
+            for u in range(left, right + 1):
+                w1 = (u - u0) * (v2 - v0) - (u2 - u0) * (v - v0)
+                w2 = (u1 - u0) * (v - v0) - (u - u0) * (v1 - v0)
+                w0 = area - w1 - w2
+                if w0 < 0 or w1 < 0 or w2 < 0:
+                    continue
+                if layers.samples_mm[v, u] > 0:
+                    layers.plain[v, u] = True
+                    layers.depth_mm[v, u] = layers.samples_mm[v, u]
+                    layers.spread_mm2[v, u] = 0
+                    continue
+                if (w0 > 0 or owned[0]) and (w1 > 0 or owned[1]) and (w2 > 0 or owned[2]):
+                    layers.spread_mm2[v, u] = spread
+                edge = (w0 == 0 and plain[0]) or (w1 == 0 and plain[1]) or (w2 == 0 and plain[2])
+                layers.plain[v, u] = edge or not bridge
+                if bridge and not edge:
+                    near = layers.nearest[v, u]
+                    layers.depth_mm[v, u] = layers.samples_mm[near // width, near % width]
+                else:
+                    layers.depth_mm[v, u] = (w0 * z0 + w1 * z1 + w2 * z2) / area
+
+
+class Surface:
+    """A dense model that samples can be added to.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Height and width of the image in pixels.
+    threads : int, optional
+        Kernel threads of the first `add`; default `default_threads()`. Later ones use one.
+
+    Attributes
+    ----------
+    layers : Layers
+        What is known at every pixel. They are the surface's own: read them, and copy what is to
+        outlast the next `add`.
+    """
+
+    def __init__(self, shape: tuple[int, int], threads: int | None = None) -> None:
+        self._threads = threads
+        self.layers = Layers(
+            samples_mm=np.zeros(shape, np.float32),
+            nearest=np.full(shape, -1, np.int32),
+            gap_sq=np.full(shape, FAR_SQ, np.int32),
+            depth_mm=np.zeros(shape, np.float32),
+            plain=np.zeros(shape, np.bool_),
+            spread_mm2=np.zeros(shape, np.float32),
+            touched=np.ones(tuple(-(-pixels // TILE_PX) for pixels in shape), np.bool_),
+        )
+        self._uv = np.empty((0, 2), np.int32)
+        self._depth_mm = np.empty(0, np.float32)
+        self._mesh: Mesh | None = None
+
+    def add(self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.generic]) -> None:
+        """Take in samples: pixels (n, 2), column first, none given before, and depth (n,) in mm.
+
+        Those without depth (0 or negative) are left out.
+        """
+        mm = depth_mm.astype(np.float32)
+        returned = mm > 0
+        uv, mm = np.ascontiguousarray(uv[returned], np.int32), mm[returned]
+        if not len(uv):
+            return
+        layers, first = self.layers, not len(self._uv)
+        self._uv = np.concatenate((self._uv, uv))
+        self._depth_mm = np.concatenate((self._depth_mm, mm))
+        layers.samples_mm[uv[:, 1], uv[:, 0]] = mm
+        if first:  # one by one, the first of many samples would claim whole images
+            layers.nearest[:], layers.gap_sq[:] = nearest_sample(
+                layers.samples_mm > 0, self._threads
+            )
+            layers.depth_mm[:] = layers.samples_mm.ravel()[layers.nearest]
+            layers.touched[:] = True
+        else:
+            _claim(layers, uv)
+        if self._mesh is None:
+            self._mesh = Mesh.of(self._uv, 2 * len(self._uv), layers.depth_mm.shape)
+        else:
+            if len(self._uv) > len(self._mesh.uv):
+                self._mesh = self._mesh.copy(2 * len(self._uv))
+                self._mesh.changed[:] = False
+            self._mesh.add(uv)
+        mesh = self._mesh
+        if mesh is None:  # all on one line
+            return
+        changed = np.flatnonzero(mesh.changed[: mesh.triangles])
+        inside = (mesh.tri[changed] != GHOST).all(axis=1)
+        mesh.changed[: mesh.triangles] = False
+        drawn = changed[inside].astype(np.int32)
+        limits = (STEP_MM, BRIDGE_PX)
+
+        def draw(begin: int, end: int) -> None:
+            part = drawn[begin:end]
+            _draw(layers, mesh.uv, self._depth_mm, mesh.tri, mesh.adj, part, limits)
+
+        in_bands(draw, len(drawn), self._threads if first else 1)
