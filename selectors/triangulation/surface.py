@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.triangulation.delaunay import GHOST, Mesh
 from selective_depth.selectors.triangulation.nearest import FAR_SQ, nearest_sample
