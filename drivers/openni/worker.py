@@ -1,49 +1,37 @@
 """The process that owns OpenNI2: native code that may crash or hang does it here, alone.
 
-Started by `openni_process.Worker` as a script, so that it needs neither NumPy nor the package
-and is up in a fraction of the time. It is told what to do by one JSON line on standard input,
-then by short commands; it answers in JSON lines on what was its standard output. Depth images
-go through shared memory. When its parent goes, whichever way, its standard input ends and so
-does it.
+Started by `process.Worker` as a script, so that it needs neither NumPy nor the package and is up
+in a fraction of the time. One JSON line on standard input tells what to do, then short commands;
+answers are JSON lines on what was its standard output, and depth images go through shared memory.
 """
 
 from __future__ import annotations
 
 import ctypes
-import json
-import mmap
 import os
-import queue
 import signal
 import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from primesense import _openni2 as c_api
 from primesense import openni2
 from primesense.utils import OpenNIError
 
+if TYPE_CHECKING:
+    from selective_depth.drivers.openni.link import JobError, Parent, Slots, forbid_core_dumps
+else:  # a script finds what lies beside it only if told; last, to stand in nothing's way
+    sys.path.append(str(Path(__file__).parent))
+    from link import JobError, Parent, Slots, forbid_core_dumps
+
 WAIT_S = 0.2  # longest uninterrupted wait for a frame, and the beat of "idle" messages
-LEAVE_S = 3.0  # from the parent's end to this process's, at most
 SETTLE_S = 0.05  # between stop and close: the runtime's threads set their flags late
 RECORDER_START_S = 5.0  # for the recorder's own thread to write the file's beginning
 DATA_BEGIN = b"NIR\0\x08\0\0\0"  # the record after which it takes frames
 MILLIMETRES = int(openni2.PIXEL_FORMAT_DEPTH_1_MM)
 NO_GROWTH_S = 1.5  # a frame takes some 100 kB: a file that stops growing is not being written
-
-
-class JobError(Exception):
-    """Ends the job; `kind` is the name of the error that the parent raises.
-
-    A `remedy` is what to do unless the USB bus, where the parent looks, tells more.
-    """
-
-    def __init__(self, kind: str, message: str, remedy: str = "") -> None:
-        super().__init__(message)
-        self.kind = kind
-        self.remedy = remedy
 
 
 class Device(openni2.Device):  # type: ignore[misc]
@@ -55,91 +43,6 @@ class Device(openni2.Device):  # type: ignore[misc]
     def _close(self) -> None:
         if getattr(self, "_devinfo", None) is not None:
             super()._close()
-
-
-class Parent:
-    """Both ends of the conversation with the process that started this one."""
-
-    def __init__(self) -> None:
-        # Drivers print on standard output: the answers move to a descriptor of their own.
-        self._out = os.dup(1)
-        os.dup2(2, 1)
-        self._pid = os.getppid()
-        self._commands = open(0, "rb", closefd=False)  # noqa: SIM115 - for all its life
-        self.free_slots: queue.SimpleQueue[int] = queue.SimpleQueue()
-        self.stop = threading.Event()
-
-    def first_job(self) -> dict[str, Any]:
-        """What to do; from now on the parent is watched."""
-        line = self._commands.readline()
-        if not line:
-            os._exit(0)
-        job: dict[str, Any] = json.loads(line)
-        for watch in (self._listen, self._look_after):
-            threading.Thread(target=watch, daemon=True).start()
-        return job
-
-    def send(self, kind: str, **values: object) -> None:
-        """Say one thing."""
-        line = memoryview(json.dumps({"kind": kind, **values}).encode() + b"\n")
-        try:
-            while line:
-                line = line[os.write(self._out, line) :]
-        except BrokenPipeError:
-            self.stop.set()  # there is nobody left to tell, but a recording still has to be ended
-
-    def _listen(self) -> None:
-        for line in self._commands:
-            word, _, number = line.decode().strip().partition(" ")
-            if word == "free":
-                self.free_slots.put(int(number))
-            else:
-                self.stop.set()
-        self._leave()  # the pipe is closed: asked to go, or the parent is no more
-
-    def _look_after(self) -> None:
-        """Notice the parent's end even if a process that it forked keeps our pipe open."""
-        while os.getppid() == self._pid:
-            time.sleep(0.5)
-        self._leave()
-
-    def _leave(self) -> None:
-        """Give a recording the time to end its file; nothing may outlive this, hanging or not."""
-        self.stop.set()
-        time.sleep(LEAVE_S)
-        os._exit(1)
-
-
-class Slots:
-    """The shared memory: equal slots, each free or holding one depth image."""
-
-    def __init__(self, job: dict[str, Any], parent: Parent) -> None:
-        size = job["slots"] * job["slot_bytes"]
-        if sys.platform == "win32":
-            memory = mmap.mmap(-1, size, tagname=job["memory"])
-        else:
-            memory = mmap.mmap(job["memory"], size)
-        self._start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
-        self._memory = memory
-        self._slot_bytes: int = job["slot_bytes"]
-        self._parent = parent
-        for slot in range(job["slots"]):
-            parent.free_slots.put(slot)
-
-    def take(self) -> int | None:
-        """A free slot; None if there is none."""
-        try:
-            return self._parent.free_slots.get_nowait()
-        except queue.Empty:
-            return None
-
-    def fill(self, slot: int, address: int, size: int) -> None:
-        """Copy an image from the runtime's memory, which it will use again."""
-        ctypes.memmove(self._start + slot * self._slot_bytes, address, size)
-
-    def fits(self, size: int) -> bool:
-        """Whether an image of so many bytes has room."""
-        return size <= self._slot_bytes
 
 
 def initialize(job: dict[str, Any]) -> None:
@@ -522,14 +425,6 @@ JOBS = {
     "device": run_device,
     "record": run_record,
 }
-
-
-def forbid_core_dumps() -> None:
-    """A crash here is expected; writing its memory out would delay the next start."""
-    if os.name == "posix":
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def main() -> None:

@@ -146,16 +146,15 @@ def acquire(
     ----------
     measure : callable
         The sensor: pixels (n, 2), column first, to depth (n,) in millimetres; what is no depth
-        (see `measured_mm`) or masked is no return.
-        It is asked for nothing but the chosen pixels, each at most once.
+        (see `measured_mm`) or masked is no return. Asked for the chosen pixels only, each once.
     seeds : SeedGrid
         The first measurements; they are not part of the budget.
     budget : float, default 0.05
         Share of the frame's pixels. A measurement that returns nothing is paid for as well.
         (A whole number from 2 on is taken as `shots`.)
     rounds : int, default 8
-        In how many rounds; 1 decides everything from the seeds. Where these are few and far
-        apart, the first of several rounds makes their lattice finer (`finer_lattice`).
+        1 decides everything from the seeds. Where these are few and far apart, the first of
+        several rounds makes their lattice finer (`finer_lattice`).
     selector : Selector or callable, optional
         What a shot is worth, from the samples so far: any selector, or a function of one's own
         (see `plan_of`); default `best_selector`.
