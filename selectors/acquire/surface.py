@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from selective_depth.selectors.choice import best_pixels
+from selective_depth.selectors.choice import choose
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
@@ -166,8 +166,7 @@ class SurfacePlan:
     def best(self, shots: int) -> npt.NDArray[np.int32]:
         """The `shots` pixels that are worth most, from the samples as they are now."""
         self.look()
-        tiles = np.arange(self._surface.layers.touched.size)
-        return best_pixels(self.score, tiles, shots, 0.0, TILE_PX, self._rule.threads)[0]
+        return choose(self.score, shots, threads=self._rule.threads)
 
     def model_mm(self) -> Float32Array:
         """Dense depth of the samples as they are now, float32 (height, width); a copy."""

@@ -133,6 +133,19 @@ def _bridges(
     return bool(longest > bridge_px * bridge_px)
 
 
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def _along_edge(
+    uv: Int32Array, z_mm: Float32Array, corners: Int32Array, across: int, u: int, v: int
+) -> np.float32:
+    """Depth at a pixel of the edge across from a corner: to the last bit, either triangle's."""
+    a, b = corners[(across + 1) % 3], corners[(across + 2) % 3]
+    if a > b:
+        a, b = b, a
+    du, dv = uv[b, 0] - uv[a, 0], uv[b, 1] - uv[a, 1]
+    step, whole = (u - uv[a, 0], du) if abs(du) >= abs(dv) else (v - uv[a, 1], dv)
+    return np.float32(z_mm[a] + (z_mm[b] - z_mm[a]) * np.float32(step) / np.float32(whole))
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw(
     layers: Layers,
@@ -153,7 +166,9 @@ def _draw(
     plain, owned = np.empty(3, np.bool_), np.empty(3, np.bool_)
     for t in changed:
         a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
-        u0, v0, u1, v1, u2, v2 = uv[a, 0], uv[a, 1], uv[b, 0], uv[b, 1], uv[c, 0], uv[c, 1]
+        u0, v0 = np.int64(uv[a, 0]), np.int64(uv[a, 1])
+        u1, v1 = np.int64(uv[b, 0]), np.int64(uv[b, 1])
+        u2, v2 = np.int64(uv[c, 0]), np.int64(uv[c, 1])
         z0, z1, z2 = z_mm[a], z_mm[b], z_mm[c]
         mean = (z0 + z1 + z2) / np.float32(3)
         spread = ((z0 - mean) ** 2 + (z1 - mean) ** 2 + (z2 - mean) ** 2) / np.float32(3)
@@ -167,6 +182,7 @@ def _draw(
             du, dv = uv[end, 0] - uv[begin, 0], uv[end, 1] - uv[begin, 1]
             owned[k] = hull or dv > 0 or (dv == 0 and du > 0)
         area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)  # positive: they run anticlockwise
+        inverse = np.float32(1) / np.float32(area)
         left, right, top, bottom = (
             min(u0, u1, u2),
             max(u0, u1, u2),
@@ -175,26 +191,37 @@ def _draw(
         )
         _touch(layers.touched, top, left, bottom, right)
         for v in range(top, bottom + 1):
+            # The three weights are linear along a row: one more pixel is one addition each.
+            w1 = (left - u0) * (v2 - v0) - (u2 - u0) * (v - v0)
+            w2 = (u1 - u0) * (v - v0) - (left - u0) * (v1 - v0)
+            entered = False
             for u in range(left, right + 1):
-                w1 = (u - u0) * (v2 - v0) - (u2 - u0) * (v - v0)
-                w2 = (u1 - u0) * (v - v0) - (u - u0) * (v1 - v0)
                 w0 = area - w1 - w2
-                if w0 < 0 or w1 < 0 or w2 < 0:
+                at1, at2 = w1, w2
+                w1, w2 = w1 + (v2 - v0), w2 - (v1 - v0)
+                if w0 < 0 or at1 < 0 or at2 < 0:
+                    if entered:
+                        break  # what is inside of a row is one run
                     continue
-                if layers.samples_mm[v, u] > 0:
+                entered = True
+                sample_mm = layers.samples_mm[v, u]
+                if sample_mm > 0:
                     layers.plain[v, u] = True
-                    layers.depth_mm[v, u] = layers.samples_mm[v, u]
+                    layers.depth_mm[v, u] = sample_mm
                     layers.spread_mm2[v, u] = 0
                     continue
-                if (w0 > 0 or owned[0]) and (w1 > 0 or owned[1]) and (w2 > 0 or owned[2]):
+                if (w0 > 0 or owned[0]) and (at1 > 0 or owned[1]) and (at2 > 0 or owned[2]):
                     layers.spread_mm2[v, u] = spread
-                edge = (w0 == 0 and plain[0]) or (w1 == 0 and plain[1]) or (w2 == 0 and plain[2])
-                layers.plain[v, u] = edge or not bridge
-                if bridge and not edge:
+                edge = 0 if w0 == 0 else (1 if at1 == 0 else (2 if at2 == 0 else -1))
+                plainly = not bridge or (edge >= 0 and plain[edge])
+                layers.plain[v, u] = plainly
+                if not plainly:
                     near = layers.nearest[v, u]
                     layers.depth_mm[v, u] = layers.samples_mm[near // width, near % width]
+                elif edge >= 0:
+                    layers.depth_mm[v, u] = _along_edge(uv, z_mm, tri[t], edge, u, v)
                 else:
-                    layers.depth_mm[v, u] = (w0 * z0 + w1 * z1 + w2 * z2) / area
+                    layers.depth_mm[v, u] = (w0 * z0 + at1 * z1 + at2 * z2) * inverse
 
 
 class Surface:

@@ -19,16 +19,19 @@ ENDLESS = "virtual:ball?size=160x120&frames=1000000"
 MIB = 1 << 20
 
 
+ALONE = ("unshare", "--user", "--map-root-user", "--mount")
+
+
 def can_mount() -> bool:
-    """Whether this user may mount for itself alone: Linux, and root."""
-    trial = ["unshare", "--mount", "mount", "-t", "tmpfs", "tmpfs", "/mnt"]
+    """Whether this user may mount for itself alone, as Linux lets most."""
+    trial = [*ALONE, "mount", "-t", "tmpfs", "tmpfs", "/mnt"]
     return (
         bool(shutil.which("unshare")) and not subprocess.run(trial, capture_output=True).returncode
     )
 
 
 pytestmark = pytest.mark.skipif(
-    not can_mount(), reason="mounting a small disk takes Linux and root"
+    not can_mount(), reason="mounting a small disk takes Linux with user namespaces"
 )
 
 
@@ -41,7 +44,7 @@ class Disk:
         # The shell stays after the command, and the disk with it, until its input ends.
         script = f'{mount}; "$@" 2>&1; echo "exit code $?"; read end'
         self.process = subprocess.Popen(
-            ["unshare", "--mount", "sh", "-c", script, "sh", *command],
+            [*ALONE, "sh", "-c", script, "sh", *command],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
