@@ -3,14 +3,10 @@
 import os
 from typing import TYPE_CHECKING
 
-from selective_depth.app.kernel_cache import settle_cache
-
 # Milliseconds after which the allocator in rerun-sdk, mimalloc, gives back what is free; it reads
 # this when it is loaded. By its own default of 1,000, what is logged at 30 frames/s always finds
 # room in memory that is free but not given back, and the process grows for thousands of frames.
 os.environ.setdefault("MIMALLOC_PURGE_DELAY", "10")
-
-settle_cache()
 
 if TYPE_CHECKING:
     __version__: str

@@ -178,6 +178,18 @@ class PictureOptions:
 
 
 @dataclass(frozen=True)
+class EvaluationFiles:
+    """Where an evaluation is written, besides the terminal."""
+
+    json: Annotated[Path | None, optional("FILE")] = None
+    """Write the figures to a file as well."""
+    picture: Annotated[Path | None, optional("FILE.png")] = None
+    """Draw where each strategy measured and how wrong its model is, for the first frame."""
+    page: Annotated[Path | None, optional("FILE.md")] = None
+    """Write the tables in Markdown."""
+
+
+@dataclass(frozen=True)
 class Settings:
     """All options of a run."""
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from selective_depth.drivers.frame import Camera
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import sample_pairs
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.triangulation import FAR_SQ, nearest_sample

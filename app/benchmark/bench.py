@@ -18,6 +18,7 @@ import numpy as np
 
 from selective_depth.app.benchmark.peers import peer_seconds
 from selective_depth.app.commands.run import Session
+from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline import RunReport, StageSummary
 from selective_depth.app.settings import RunOptions, Settings, ViewerOptions
 from selective_depth.drivers.open import open_source
@@ -152,6 +153,10 @@ def bench(
 def _seeds_of(source: str, frames: int | None) -> list[SeedGrid]:
     seeds = []
     with open_source(source) as opened:
+        if opened.frame_count is None and frames is None:
+            raise UsageError(
+                f"'{source}' never ends; say how many frames to time, as in --frames 300."
+            )
         for frame in opened:
             seeds.append(SeedGrid.from_frame(frame))
             if frames is not None and len(seeds) >= frames:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,7 +26,7 @@ from selective_depth.app.pictures import Panel, sheet, write_picture
 from selective_depth.app.pictures.panels import error_panel, shots_panel
 from selective_depth.app.pictures.sheets import WIDTH_IN
 from selective_depth.app.pipeline import say
-from selective_depth.app.settings import PictureOptions
+from selective_depth.app.settings import EvaluationFiles, PictureOptions
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.reconstruct import reconstruct
@@ -56,10 +55,8 @@ def run_evaluation(
     seeds_shape: tuple[int, int],
     random_seeds: int,
     jobs: int | None,
-    json_file: Path | None,
-    picture: Path | None,
-    page: Path | None,
-    format_: PictureOptions,
+    files: EvaluationFiles,
+    page: PictureOptions,
 ) -> Results:
     """Evaluate, show the table and write what was asked for.
 
@@ -68,8 +65,8 @@ def run_evaluation(
     UsageError, OutputError
         If a file cannot be written; found out before the work is done where possible.
     """
-    check_picture(picture)
-    check_output(json_file, page)
+    check_picture(files.picture)
+    check_output(files.json, files.page)
     with FrameProgress("Evaluating", None) as bar:
         found = outcomes(
             sources,
@@ -85,18 +82,18 @@ def run_evaluation(
     results = summarise(found)
     count = len({outcome.frame for outcome in found})
     print_results(results, count, rounds)
-    if json_file is not None:
+    if files.json is not None:
         document = {**results, "frames": [asdict(outcome) for outcome in found]}
-        write_output(json_file, json.dumps(document, indent=1) + "\n")
-    if page is not None:
-        write_output(page, to_markdown(found))
-    if picture is not None:
+        write_output(files.json, json.dumps(document, indent=1) + "\n")
+    if files.page is not None:
+        write_output(files.page, to_markdown(found))
+    if files.picture is not None:
         frame = next(frames_of(sources, every, 1))
         shown = comparison(
-            frame, budgets[0], rounds=rounds, seeds_shape=seeds_shape, width_in=format_.width
+            frame, budgets[0], rounds=rounds, seeds_shape=seeds_shape, width_in=page.width
         )
-        write_picture(picture, shown, format_.dpi)
-    for path in (json_file, page, picture):
+        write_picture(files.picture, shown, page.dpi)
+    for path in (files.json, files.page, files.picture):
         if path is not None:
             say(f"wrote {path}")
     return results

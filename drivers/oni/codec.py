@@ -28,8 +28,8 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.drivers.oni.records import CODEC_NONE, CODEC_TABLE
 
 MAX_DISTINCT: Final = 32768

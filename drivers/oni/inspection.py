@@ -7,16 +7,14 @@ player would rely on, before it gets to see the file.
 
 from __future__ import annotations
 
-import errno
 import os
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from selective_depth.drivers.errors import DamagedRecordingError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera
+from selective_depth.drivers.oni.files import open_regular, read_payload, skip_hole, unreadable
 from selective_depth.drivers.oni.records import (
     BEGIN_FIELDS,
     CODEC_TABLE,
@@ -87,33 +85,7 @@ def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10
         try:
             return _Inspection(path, file, timeout_s).report(decode)
         except OSError as error:
-            raise _unreadable(path, error) from error
-
-
-def open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading, unbuffered, unless reading it could take for ever.
-
-    Raises
-    ------
-    SourceNotFoundError
-        If there is no such file, it is no regular file (a folder, a pipe, a device) or cannot be
-        opened.
-    """
-    try:
-        if not path.exists():
-            raise SourceNotFoundError(f"'{path}' does not exist; check its name.")
-        if not path.is_file():
-            what = "a folder" if path.is_dir() else "no regular file"
-            raise SourceNotFoundError(f"'{path}' is {what}; give a recording, FILE.oni.")
-        return path.open("rb", buffering=0)
-    except OSError as error:
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: Path, error: OSError) -> SourceNotFoundError:
-    return SourceNotFoundError(
-        f"'{path}' cannot be read ({error.strerror}); check its name and its permissions."
-    )
+            raise unreadable(path, error) from error
 
 
 class _Inspection:
@@ -233,7 +205,7 @@ class _Inspection:
         while offset < self.size:
             start, block = self._block
             if not start <= offset <= start + len(block) - len(MAGIC):
-                start = _skip_hole(self.file, offset)
+                start = skip_hole(self.file, offset)
                 self.file.seek(start)
                 block = self.file.read(_SCAN_BYTES)
                 # Kept: a file of nothing but broken records is still read only once.
@@ -451,35 +423,6 @@ class _Inspection:
             sound.append(frame)
         node.frames[:] = sound
         return decoded, swapped
-
-
-def _skip_hole(file: BinaryIO, offset: int) -> int:
-    """First byte at or after an offset that is really on the disk."""
-    if sys.platform != "linux":
-        return offset
-    try:
-        return os.lseek(file.fileno(), offset, os.SEEK_DATA)
-    except OSError as error:
-        # Nothing but a hole up to the end; or a file system that does not know.
-        return file.seek(0, os.SEEK_END) if error.errno == errno.ENXIO else offset
-
-
-def read_payload(file: BinaryIO, frame: OniFrame) -> bytes:
-    """Compressed data of a frame.
-
-    Raises
-    ------
-    DamagedRecordingError
-        If the disk does not give it.
-    """
-    try:
-        file.seek(frame.payload_offset)
-        return file.read(frame.payload_size)
-    except OSError as error:
-        raise DamagedRecordingError(
-            f"'{file.name}' cannot be read at byte {frame.payload_offset} ({error.strerror});"
-            " is its disk in order?"
-        ) from error
 
 
 def _set_property(node: OniNode, record: Record) -> None:

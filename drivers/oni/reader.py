@@ -8,7 +8,8 @@ from typing import BinaryIO
 from selective_depth.drivers.errors import DamagedRecordingError, SourceEndedError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni.codec import decode_depth
-from selective_depth.drivers.oni.inspection import inspect_oni, open_regular, read_payload
+from selective_depth.drivers.oni.files import open_regular, read_payload
+from selective_depth.drivers.oni.inspection import inspect_oni
 from selective_depth.drivers.oni.report import OniFrame, OniReport
 from selective_depth.drivers.source import DepthSource
 

@@ -12,7 +12,8 @@ from selective_depth.drivers.errors import DamagedRecordingError, OutputError
 from selective_depth.drivers.folder import FolderWriter
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni.codec import decode_depth, mend_order
-from selective_depth.drivers.oni.inspection import inspect_oni, open_regular, read_payload
+from selective_depth.drivers.oni.files import open_regular, read_payload
+from selective_depth.drivers.oni.inspection import inspect_oni
 from selective_depth.drivers.oni.records import CODEC_TABLE, CODECS, NodeAddition
 from selective_depth.drivers.oni.report import OniFrame, OniReport
 from selective_depth.drivers.oni.writer import RecordWriter, depth_properties

@@ -35,9 +35,9 @@ import math
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from selective_depth.drivers.frame import Camera, DepthArray
+from selective_depth.drivers.kernels import njit
 
 BASELINE_MM = 75.0
 """From the camera to the projector, along the image's rows."""

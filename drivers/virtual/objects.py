@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from selective_depth.drivers.errors import SourceEndedError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
+from selective_depth.drivers.kernels import njit
 from selective_depth.drivers.options import Options
 from selective_depth.drivers.source import DepthSource
 from selective_depth.drivers.virtual.ply import Mesh, read_ply

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from selective_depth.drivers.frame import Camera
+from selective_depth.drivers.kernels import njit
 
 QUAD, SPHERE, CYLINDER, DISC, TORUS = range(5)
 """Kinds of shape; what their vectors and sizes mean is told at `Shapes`."""

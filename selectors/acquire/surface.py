@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.choice import choose
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import Samples

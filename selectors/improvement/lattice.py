@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.improvement.lattice_tables import CONTRASTS, SEEDS
 from selective_depth.selectors.improvement.systems import aligned_zeros
 

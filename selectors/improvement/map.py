@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.improvement.lattice import LANES, krige_lanes
 from selective_depth.selectors.improvement.lattice_tables import SEEDS
 from selective_depth.selectors.improvement.systems import krige_window

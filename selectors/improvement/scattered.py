@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import checked_map, sample_pairs
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_over
 from selective_depth.selectors.improvement.systems import (

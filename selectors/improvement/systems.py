@@ -34,7 +34,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from selective_depth.drivers.kernels import njit
 
 MAX_SAMPLES = 32
 """Most samples in one window; of more, the nearest to its centre count."""

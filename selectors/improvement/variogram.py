@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from selective_depth.drivers.kernels import njit
 
 
 def power_table(exponent: float, reach: int) -> npt.NDArray[np.float64]:

@@ -9,9 +9,9 @@ from typing import Self
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy.spatial import cKDTree
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.neural_gas.exact import draw_nodes
 from selective_depth.selectors.parallel import in_bands
 

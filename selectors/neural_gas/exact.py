@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from selective_depth.drivers.kernels import njit
 
 ALPHA = (0.5, 0.005)
 """First and last learning rate. The first is the paper's; both are SOM Toolbox's defaults."""

@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.even import even_rank, spread
 from selective_depth.selectors.selection import Selection
 from selective_depth.selectors.triangulation import Mesh

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from selective_depth.drivers.kernels import njit
 
 GHOST = -1
 """The vertex at infinity."""

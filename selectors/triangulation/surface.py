@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.triangulation.delaunay import GHOST, Mesh
 from selective_depth.selectors.triangulation.nearest import FAR_SQ, nearest_sample
@@ -29,6 +29,7 @@ TILE_PX = 16
 
 Float32Array = npt.NDArray[np.float32]
 Int32Array = npt.NDArray[np.int32]
+Whole = int | np.int32 | np.int64
 
 
 class Layers(NamedTuple):
@@ -65,7 +66,9 @@ class Layers(NamedTuple):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _touch(touched: npt.NDArray[np.bool_], top: int, left: int, bottom: int, right: int) -> None:
+def _touch(
+    touched: npt.NDArray[np.bool_], top: Whole, left: Whole, bottom: Whole, right: Whole
+) -> None:
     """Book a change of pixels in these rows and columns, which their neighbours may heed."""
     rows, columns = touched.shape
     first_column, last_column = max(left - 1, 0) // TILE_PX, (right + 1) // TILE_PX

@@ -10,6 +10,7 @@ import pytest
 
 from selective_depth.app.benchmark import bench, peers
 from selective_depth.app.benchmark import report as bench_report
+from selective_depth.app.console.errors import UsageError
 from selective_depth.selectors.neural_gas import train_exact
 
 SOURCE = "virtual:ball?size=320x240&frames=4"
@@ -45,6 +46,11 @@ def test_figures_have_the_documented_shape(small: None, tmp_path: Path) -> None:
     assert set(report["peers"]) == {"numpy_neural_gas"}
     assert "numpy_neural_gas / neural_gas_exact" in report["ratios"]
     assert "`improvement`" in page.read_text()
+
+
+def test_a_source_without_end_is_not_read_into_memory_for_ever() -> None:
+    with pytest.raises(UsageError, match="never ends; say how many frames to time"):
+        bench.bench("virtual:ball?size=320x240&live=1")
 
 
 def test_ratios_are_peer_over_stage() -> None:

@@ -1,0 +1,173 @@
+"""Writing recorded folders: frames as 16-bit PNG files, and the sidecar that explains them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from selective_depth.drivers.errors import OutputError
+from selective_depth.drivers.folder.images import write_png
+from selective_depth.drivers.folder.sidecar import SIDECAR, Sidecar, write_sidecar
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.source import DepthSource
+
+_MILLIMETRES: Final = 1000.0
+_DEFAULT_FPS: Final = 30.0
+
+
+class FolderWriter:
+    """Writes frames as a plain folder: ``000000.png`` … and the sidecar.
+
+    The sidecar is there from the first frame on and complete after `close`, so that what a killed
+    program leaves can be read. As a context manager it leaves
+    nothing where writing failed.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder; made if it is not there. It must not hold PNG files or a sidecar yet.
+    fps : float, default 30
+        Nominal frame rate, written to the sidecar.
+    compression : int, default 3
+        0 (fast, large) to 9 (slow, small).
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be made or written, or is in use.
+    """
+
+    def __init__(
+        self, path: str | Path, *, fps: float = _DEFAULT_FPS, compression: int = 3
+    ) -> None:
+        self.path = Path(path)
+        self._compression = compression
+        self._sidecar = Sidecar(values_per_metre=_MILLIMETRES, fps=fps)
+        self._timestamps_us: list[int] = []
+        self._made = not self.path.exists()
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            used = any(
+                entry.suffix.lower() == ".png" or entry.name == SIDECAR
+                for entry in self.path.iterdir()
+            )
+        except OSError as error:
+            raise _output_error(self.path, error) from error
+        if used:
+            raise OutputError(f"'{self.path}' holds frames already; give a new or an empty folder.")
+
+    def write(self, frame: DepthFrame) -> None:
+        """Add a frame.
+
+        Raises
+        ------
+        ValueError
+            If the frame's camera differs from the first frame's.
+        OutputError
+            If it cannot be written, as on a full disk; the frames before it stay good.
+        """
+        if self._sidecar.camera is None:
+            self._sidecar = replace(self._sidecar, camera=frame.camera)
+            self._write_sidecar()
+        elif frame.camera != self._sidecar.camera:
+            raise ValueError(
+                f"frame {frame.index} has {frame.camera}, but the folder '{self.path}' is of"
+                f" {self._sidecar.camera}; write it to another folder"
+            )
+        file = self._file(len(self._timestamps_us))
+        try:
+            write_png(file, frame.depth_mm, self._compression)
+        except OSError as error:
+            # Half a file would make the whole folder unreadable.
+            file.unlink(missing_ok=True)
+            raise _output_error(file, error) from error
+        self._timestamps_us.append(frame.timestamp_us)
+
+    def close(self) -> None:
+        """Write the timestamps."""
+        if self._timestamps_us:
+            self._sidecar = replace(self._sidecar, timestamps_us=tuple(self._timestamps_us))
+            self._write_sidecar()
+
+    def discard(self) -> None:
+        """Remove what was written, so that it is not in the way of the next attempt."""
+        for index in range(len(self._timestamps_us)):
+            self._file(index).unlink(missing_ok=True)
+        (self.path / SIDECAR).unlink(missing_ok=True)
+        self._timestamps_us.clear()
+        if self._made:
+            with suppress(OSError):  # somebody else has put something there meanwhile
+                self.path.rmdir()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if isinstance(error, OutputError | ValueError):
+            self.discard()  # a source that failed leaves what it gave; a writer, nothing
+        self.close()
+
+    def _file(self, index: int) -> Path:
+        return self.path / f"{index:06d}.png"
+
+    def _write_sidecar(self) -> None:
+        try:
+            write_sidecar(self.path, self._sidecar)
+        except OSError as error:
+            raise _output_error(self.path / SIDECAR, error) from error
+
+
+def write_folder(
+    path: str | Path,
+    frames: Iterable[DepthFrame],
+    *,
+    fps: float | None = None,
+    compression: int = 3,
+) -> int:
+    """Save frames as a folder of 16-bit PNG files that `RecordedFolder` reads back bit by bit.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder; made if it is not there. It must not hold PNG files yet.
+    frames : iterable of DepthFrame
+        All of one camera; an open `DepthSource` is one.
+    fps : float, optional
+        Nominal frame rate; default that of the source, or 30.
+    compression : int, default 3
+        0 (fast, large) to 9 (slow, small).
+
+    Returns
+    -------
+    int
+        Number of frames written.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written.
+    """
+    if fps is None:
+        fps = frames.fps if isinstance(frames, DepthSource) else _DEFAULT_FPS
+    count = 0
+    with FolderWriter(path, fps=fps, compression=compression) as folder:
+        for frame in frames:
+            folder.write(frame)
+            count += 1
+    return count
+
+
+def _output_error(path: Path, error: OSError) -> OutputError:
+    return OutputError(
+        f"'{path}' cannot be written ({error.strerror}); check the folder's permissions and the"
+        " free space, or choose another folder."
+    )
