@@ -25,6 +25,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import tomli_w
+
 from selective_depth.drivers.errors import DamagedRecordingError
 from selective_depth.drivers.folder.images import MAX_SIDE
 from selective_depth.drivers.frame import MOST_PX, MOST_TIME_US, Camera
@@ -98,18 +100,19 @@ def read_sidecar(folder: Path) -> Sidecar:
 
 def write_sidecar(folder: Path, sidecar: Sidecar) -> None:
     """Write ``frames.toml``, whole or not at all."""
-    lines = ["# Depth frames as 16-bit PNG: what the numbers in the files mean."]
+    said: dict[str, Any] = {}
     for name, value in vars(sidecar).items():
-        if isinstance(value, tuple):
-            lines.append(f"{name} = {list(value)}")
-        elif isinstance(value, int | float):
-            lines.append(f"{name} = {float(value)!r}")
-    if sidecar.camera is not None:
-        lines.append("\n[camera]")
-        lines.extend(f"{key} = {getattr(sidecar.camera, key)!r}" for key in _CAMERA_KEYS)
+        if isinstance(value, Camera):
+            sizes = {key: int(getattr(value, key)) for key in _CAMERA_KEYS[:2]}
+            said[name] = sizes | {key: float(getattr(value, key)) for key in _CAMERA_KEYS[2:]}
+        elif isinstance(value, tuple):
+            said[name] = [int(each) for each in value]  # NumPy's whole numbers too
+        elif value is not None:
+            said[name] = float(value)
+    text = "# Depth frames as 16-bit PNG: what the numbers in the files mean.\n"
     new = folder / f"{SIDECAR}.new"
     try:
-        new.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        new.write_text(text + tomli_w.dumps(said), encoding="utf-8")
         new.replace(folder / SIDECAR)
     except OSError:
         new.unlink(missing_ok=True)

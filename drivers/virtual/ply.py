@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,11 +13,12 @@ import numpy.typing as npt
 from selective_depth.drivers.errors import DamagedRecordingError, SourceNotFoundError
 
 _SCALARS = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
-    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+    "char": "b", "int8": "b", "uchar": "B", "uint8": "B",
+    "short": "h", "int16": "h", "ushort": "H", "uint16": "H",
+    "int": "i", "int32": "i", "uint": "I", "uint32": "I",
+    "float": "f", "float32": "f", "double": "d", "float64": "d",
 }  # fmt: skip
+"""The codes of `struct`, which are NumPy's too."""
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 64 * 1024
 _LARGEST = 1e100  # of a coordinate: differences and squares still have room
@@ -42,8 +45,13 @@ class Mesh:
 @dataclass
 class _Property:
     name: str
-    scalar: str  # numpy code without byte order
+    scalar: str  # a code of `_SCALARS`, without byte order
     count: str | None = None  # the same of a list's length; None for a plain value
+
+    @property
+    def least(self) -> int:
+        """Bytes it takes in a row at least: those of its value, or of its list's length."""
+        return struct.calcsize("<" + (self.count or self.scalar))
 
 
 @dataclass
@@ -81,9 +89,11 @@ def read_ply(path: Path) -> Mesh:
         raise SourceNotFoundError(f"'{path}' cannot be read: {error.strerror}") from error
     try:
         order, elements, start = _header(data)
-        columns = _ascii_body(data[start:], elements) if order == "" else None
-        if columns is None:
-            columns = _binary_body(data, start, order, elements)
+        if not order:
+            data, order, start = _binary(data[start:], elements), "<", 0
+        columns: _Columns = {}
+        for element in elements:
+            start = _read_element(data, start, order, element, columns)
         return _mesh(columns)
     except _NoPlyError:
         raise SourceNotFoundError(
@@ -103,15 +113,18 @@ class _BadPlyError(Exception):
     """What is wrong, as a clause."""
 
 
-_Columns = dict[tuple[str, str], "npt.NDArray[np.generic] | _Lists"]
-
-
 @dataclass
-class _Lists:
-    """A list property: the lists' lengths, shape (rows,), and their items, end to end."""
+class _Column:
+    """One property of all rows: the lists' lengths, shape (rows,), and their items, end to end.
+
+    A plain value is a list of one.
+    """
 
     lengths: npt.NDArray[np.int64]
-    items: npt.NDArray[np.generic]
+    items: npt.NDArray[np.float64]
+
+
+_Columns = dict[tuple[str, str], _Column]
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
@@ -138,13 +151,15 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
             case ["format", name, _] if name in _FORMATS and order is None:
                 order = _FORMATS[name]
             case ["element", name, rows] if rows.isascii() and rows.isdecimal() and len(rows) < 12:
+                if any(each.name == name for each in elements):
+                    raise _BadPlyError(f"its header has two elements '{name:.40}'")
                 elements.append(_Element(name, int(rows)))
             case ["property", scalar, name] if scalar in _SCALARS and elements:
                 elements[-1].properties.append(_Property(name, _SCALARS[scalar]))
             case ["property", "list", count, scalar, name] if (
                 count in _SCALARS and scalar in _SCALARS and elements
             ):
-                if _SCALARS[count].startswith("f"):
+                if _SCALARS[count] in "fd":
                     raise _BadPlyError(f"its header gives a list length as {count}: '{line}'")
                 elements[-1].properties.append(_Property(name, _SCALARS[scalar], _SCALARS[count]))
             case _:
@@ -154,172 +169,116 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
     return order, elements, start
 
 
-def _ascii_body(data: bytes, elements: list[_Element]) -> _Columns:
+def _binary(text: bytes, elements: list[_Element]) -> bytes:
+    """A text body as a binary one in which everything is a double; `elements` are changed to it."""
+    words = text.split()
     try:
-        numbers = np.array(data.split(), dtype=np.float64)
+        numbers = np.fromiter(map(float, words), "<f8", len(words))
     except ValueError as error:
-        raise _BadPlyError(f"its text holds something else than numbers ({error})") from error
-    columns: _Columns = {}
-    at = 0
-    for element in elements:
-        at = _walk_numbers(numbers, at, element, columns)
-    return columns
-
-
-def _walk_numbers(
-    numbers: npt.NDArray[np.float64], at: int, element: _Element, columns: _Columns
-) -> int:
-    """Cut one element out of a row of numbers; return where the next one begins."""
-    properties, rows = element.properties, element.rows
-    if not rows or not properties:
-        return at
-    _check_room(len(numbers) - at, rows * len(properties), element, "numbers")
-    # The usual case first: all lists of the element are as long as those of its first row.
-    lengths, width = [], 0
-    for each in properties:
-        length = 1
-        if each.count is not None:
-            _check_room(len(numbers) - at, width + 1, element, "numbers")
-            length = _list_length(numbers[at + width])
-            width += 1
-        lengths.append(length)
-        width += length
-    if width * rows <= len(numbers) - at:
-        table = numbers[at : at + width * rows].reshape(rows, width)
-        column = 0
-        uniform: _Columns = {}
-        for each, length in zip(properties, lengths, strict=True):
-            if each.count is not None:
-                if not (table[:, column] == length).all():
-                    break
-                column += 1
-                flat = table[:, column : column + length].ravel()
-                uniform[element.name, each.name] = _Lists(np.full(rows, length), flat)
-            else:
-                uniform[element.name, each.name] = table[:, column]
-            column += length
-        else:
-            columns.update(uniform)
-            return at + width * rows
-    values: list[list[float]] = [[] for _ in properties]
-    counts: list[list[int]] = [[] for _ in properties]
-    for _ in range(rows):
-        for number, each in enumerate(properties):
-            length = 1
-            if each.count is not None:
-                _check_room(len(numbers) - at, 1, element, "numbers")
-                length = _list_length(numbers[at])
-                counts[number].append(length)
-                at += 1
-            _check_room(len(numbers) - at, length, element, "numbers")
-            values[number].extend(numbers[at : at + length].tolist())
-            at += length
-    _store(element, values, counts, columns)
-    return at
-
-
-def _binary_body(data: bytes, at: int, order: str, elements: list[_Element]) -> _Columns:
-    columns: _Columns = {}
-    for element in elements:
-        at = _walk_bytes(data, at, order, element, columns)
-    return columns
-
-
-def _walk_bytes(data: bytes, at: int, order: str, element: _Element, columns: _Columns) -> int:
-    """Cut one element out of the bytes; return where the next one begins."""
-    properties, rows = element.properties, element.rows
-    if not rows or not properties:
-        return at
-    least = sum(int((each.count or each.scalar)[1:]) for each in properties)
-    _check_room(len(data) - at, rows * least, element, "bytes")
-    # The usual case first: all lists of the element are as long as those of its first row.
-    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-    width = 0
-    for number, each in enumerate(properties):
-        if each.count is None:
-            fields.append((f"v{number}", order + each.scalar))
-        else:
-            length = _length_at(data, at + width, order + each.count, element)
-            fields.append((f"n{number}", order + each.count))
-            fields.append((f"v{number}", order + each.scalar, (length,)))
-            width += int(each.count[1:])
-        width = np.dtype(fields).itemsize
-    if width * rows <= len(data) - at:
-        table = np.frombuffer(data, np.dtype(fields), rows, at)
-        if all((table[f"n{k}"] == table[f"n{k}"][0]).all()
-               for k, each in enumerate(properties) if each.count is not None):  # fmt: skip
-            for k, each in enumerate(properties):
-                value = table[f"v{k}"]
-                columns[element.name, each.name] = (
-                    value
-                    if each.count is None
-                    else _Lists(table[f"n{k}"].astype(np.int64), value.ravel())
-                )
-            return at + width * rows
-    values: list[list[float]] = [[] for _ in properties]
-    counts: list[list[int]] = [[] for _ in properties]
-    for _ in range(rows):
-        for number, each in enumerate(properties):
-            length = 1
-            if each.count is not None:
-                length = _length_at(data, at, order + each.count, element)
-                counts[number].append(length)
-                at += int(each.count[1:])
-            size = length * int(each.scalar[1:])
-            _check_room(len(data) - at, size, element, "bytes")
-            values[number].extend(np.frombuffer(data, order + each.scalar, length, at).tolist())
-            at += size
-    _store(element, values, counts, columns)
-    return at
-
-
-def _store(
-    element: _Element, values: list[list[float]], counts: list[list[int]], columns: _Columns
-) -> None:
-    for each, value, count in zip(element.properties, values, counts, strict=True):
-        array = np.array(value, dtype=np.float64)
-        columns[element.name, each.name] = (
-            array if each.count is None else _Lists(np.array(count, dtype=np.int64), array)
-        )
-
-
-def _length_at(data: bytes, at: int, code: str, element: _Element) -> int:
-    _check_room(len(data) - at, int(code[2:]), element, "bytes")
-    return _list_length(float(np.frombuffer(data, code, 1, at)[0]))
-
-
-def _list_length(number: float) -> int:
-    if not 0 <= number < 2**31 or number != int(number):
-        raise _BadPlyError(f"it has a list of {number:g} items")
-    return int(number)
-
-
-def _check_room(there: int, needed: int, element: _Element, unit: str) -> None:
-    if needed > there:
         raise _BadPlyError(
-            f"it ends within its {element.rows} rows of '{element.name}':"
-            f" at least {needed - there} {unit} are missing"
-        )
+            f"its text holds something else than numbers ({error!s:.100})"
+        ) from error
+    for element in elements:
+        for each in element.properties:
+            each.scalar, each.count = "d", each.count and "d"
+    return numbers.tobytes()
+
+
+def _read_element(data: bytes, at: int, order: str, element: _Element, columns: _Columns) -> int:
+    """Cut one element out of the bytes; return where the next one begins."""
+    if not element.rows or not element.properties:
+        return at
+    # Held against the bytes that are left before anything is sized by it.
+    _check_room(data, at, element.rows * sum(each.least for each in element.properties), element)
+    places, end = _walk(data, at, order, element, 1)
+    width = end - at  # the usual case first: all rows are laid out as the first
+    steps = width * np.arange(element.rows)
+    uniform = width * element.rows <= len(data) - at and all(
+        (_gather(data, begins - each.least + steps, None, order + each.count) == lengths[0]).all()
+        for each, (begins, lengths) in zip(element.properties, places, strict=True)
+        if each.count
+    )
+    if uniform:
+        places = [(begins + steps, np.repeat(lengths, element.rows)) for begins, lengths in places]
+        end = at + width * element.rows
+    else:
+        places, end = _walk(data, at, order, element, element.rows)
+    for each, (begins, lengths) in zip(element.properties, places, strict=True):
+        items = _gather(data, begins, lengths, order + each.scalar)
+        columns[element.name, each.name] = _Column(lengths, items)
+    return end
+
+
+_Places = list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]
+"""Of each property: the byte at which its items begin in each row, and their number."""
+
+
+def _walk(data: bytes, at: int, order: str, element: _Element, rows: int) -> tuple[_Places, int]:
+    """Where the items of the next rows lie, and the byte after them."""
+    readers = [each.count and struct.Struct(order + each.count) for each in element.properties]
+    sizes = [struct.calcsize(order + each.scalar) for each in element.properties]
+    found = [(array("q"), array("q")) for _ in sizes]
+    for _ in range(rows):
+        for reader, size, (begins, lengths) in zip(readers, sizes, found, strict=True):
+            length = 1
+            if reader:
+                _check_room(data, at, reader.size, element)
+                number = reader.unpack_from(data, at)[0]
+                at += reader.size
+                if not 0 <= number < 2**31 or number != int(number):
+                    raise _BadPlyError(f"it has a list of {number:g} items")
+                length = int(number)
+            _check_room(data, at, length * size, element)
+            begins.append(at)
+            lengths.append(length)
+            at += length * size
+    return [
+        (np.array(begins, np.int64), np.array(lengths, np.int64)) for begins, lengths in found
+    ], at
+
+
+def _gather(
+    data: bytes,
+    begins: npt.NDArray[np.int64],
+    lengths: npt.NDArray[np.int64] | None,
+    code: str,
+) -> npt.NDArray[np.float64]:
+    """The numbers that begin at these bytes: runs of these lengths (default: 1), end to end."""
+    kind = np.dtype(code)
+    if lengths is not None:
+        within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+        begins = np.repeat(begins, lengths) + within * kind.itemsize
+    each_byte = np.frombuffer(data, np.uint8)
+    picked = np.empty((len(begins), kind.itemsize), np.uint8)
+    for byte in range(kind.itemsize):
+        picked[:, byte] = each_byte[begins + byte]
+    return picked.view(kind).ravel().astype(np.float64)
+
+
+def _check_room(data: bytes, at: int, needed: int, element: _Element) -> None:
+    if needed > len(data) - at:
+        raise _BadPlyError(f"it ends within its {element.rows} rows of '{element.name:.40}'")
 
 
 def _mesh(columns: _Columns) -> Mesh:
     axes = []
     for axis in "xyz":
         column = columns.get(("vertex", axis))
-        if not isinstance(column, np.ndarray):
+        if column is None or (column.lengths != 1).any():
             raise _BadPlyError(f"it has no vertices with a plain property '{axis}'")
-        axes.append(column.astype(np.float64))
+        axes.append(column.items)
     points = np.stack(axes, axis=1)
     if not (np.abs(points) < _LARGEST).all():  # NaN fails as well
         raise _BadPlyError(f"some of its coordinates are not finite, or beyond {_LARGEST:g}")
     faces = next((columns[key] for name in _FACE_LISTS if (key := ("face", name)) in columns), None)
-    if not isinstance(faces, _Lists):
+    if faces is None:
         return Mesh(points, np.zeros((0, 3), np.int32))
-    items = faces.items.astype(np.float64)
-    if items.size and not (items.min() >= 0 and items.max() < len(points)):
+    items = faces.items
+    wrong = items[~((items >= 0) & (items < len(points)) & (items == np.floor(items)))]
+    if len(wrong):
         raise _BadPlyError(
-            f"a face names vertex {items.max():g} or {items.min():g}, but there are"
-            f" {len(points)} vertices"
+            f"a face names vertex {wrong[0]:g}; there are {len(points)} vertices, counted from 0"
+            " in whole numbers"
         )
     return Mesh(points, _fans(faces.lengths, items.astype(np.int32)))
 

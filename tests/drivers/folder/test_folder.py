@@ -599,3 +599,14 @@ def test_a_disk_that_fills_leaves_nothing_in_the_way(small_disk: Path) -> None:
             write_oni(small_disk / "out.oni", frames)
         assert list(small_disk.iterdir()) == []
     assert write_folder(small_disk / "out", frames[:1]) == 1
+
+
+def test_numbers_of_numpy_are_written_as_toml_has_them(tmp_path):
+    camera = Camera(np.int64(4), np.int32(3), np.float64(2.5), np.float32(2.5), 2.0, 1)
+    frame = DepthFrame(np.ones((3, 4), np.uint16), 0, np.int64(1 << 61), camera)
+    assert write_folder(tmp_path / "kept", [frame], fps=np.float64(29.97)) == 1
+    with RecordedFolder(tmp_path / "kept") as source:
+        assert source.fps == 29.97
+        back = source.read()
+    assert back.camera == camera
+    assert back.timestamp_us == 1 << 61

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import math
 import struct
+import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -140,12 +142,15 @@ HEADER = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty fl
         ("ply\nend_header\n1 2 3\n", "names no format"),
         ("ply\nformat morse 1.0\nend_header\n", "format morse"),
         (HEADER + "end_header\n1 2\n", "property 'z'"),
-        (HEADER + "property float z\nend_header\n1 2\n", "1 numbers are missing"),
+        (HEADER + "property float z\nend_header\n1 2\n", "ends within its 1 rows of 'vertex'"),
         (HEADER + "property float z\nend_header\n1 2 nan\n", "not finite"),
         (HEADER + "property float z\nend_header\n1 2 1e300\n", "beyond 1e"),
         (HEADER + "property float z\nend_header\n1 2 three\n", "something else than numbers"),
         (HEADER + "property string z\nend_header\n1 2 3\n", "property string z"),
-        (HEADER.replace("1\np", "99999999999\np") + "end_header\n1 2\n", "are missing"),
+        (
+            HEADER.replace("1\np", "99999999999\np") + "end_header\n1 2\n",
+            "ends within its 99999999999 rows",
+        ),
         (
             HEADER + "property float z\nelement face 1\nproperty list uchar int vertex_indices\n"
             "end_header\n1 2 3\n3 0 1 0\n",
@@ -156,6 +161,12 @@ HEADER = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty fl
             "end_header\n1 2 3\n-3 0 0 0\n",
             "list of -3 items",
         ),
+        (
+            HEADER + "property float z\nelement face 1\nproperty list uchar int vertex_indices\n"
+            "end_header\n1 2 3\n3 0 0.7 0\n",
+            r"names vertex 0\.7; there are 1 vertices",
+        ),
+        (HEADER + "element vertex 1\nproperty float z\nend_header\n1 2 3\n", "two elements"),
     ],
 )
 def test_what_is_wrong_is_told(file, text, says):
@@ -163,6 +174,66 @@ def test_what_is_wrong_is_told(file, text, says):
     with pytest.raises((SourceNotFoundError, DamagedRecordingError), match=says) as caught:
         open_source(file)
     assert str(file) in str(caught.value)
+
+
+@pytest.mark.parametrize("items", [2**28, 2**31 - 1, 2**31, 2**32 - 1])
+@pytest.mark.parametrize("scalar", ["uchar", "double"])
+def test_a_list_that_claims_more_than_the_file_holds_is_refused_at_once(file, items, scalar):
+    head = ply_bytes([(0, 0, 0)], [(0, 0, 0)], "binary_little_endian").partition(b"end_header")[0]
+    head = head.replace(b"list uchar int", f"list uint {scalar}".encode())
+    rows = struct.pack("<3d", 0, 0, 0) + struct.pack("<I", items) + bytes(300)
+    file.write_bytes(head + b"end_header\n" + rows)
+    tracemalloc.start()
+    with pytest.raises(DamagedRecordingError, match=r"ends within its 1 rows|a list of"):
+        read_ply(file)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100_000
+
+
+def test_short_faces_of_all_lengths_do_not_take_long(file):
+    """3 MB of polygons of no, one and three corners: the worst that a mixed file can be."""
+    corners = np.arange(12.0).reshape(4, 3)
+    head = ply_bytes(corners, [()], "binary_big_endian").replace(b"uchar int", b"uchar uchar")
+    rows = 430_000
+    head = head[:-1].replace(b"element face 1", b"element face %d" % (3 * rows))
+    file.write_bytes(head + bytes([0, 1, 3, 3, 0, 1, 2]) * rows)
+    start = time.process_time()
+    mesh = read_ply(file)
+    assert time.process_time() - start < 10
+    assert mesh.triangles.shape == (rows, 3)
+    assert (mesh.triangles == (0, 1, 2)).all()
+
+
+@pytest.mark.parametrize("count", [200, pytest.param(2000, marks=pytest.mark.slow)])
+def test_headers_and_counts_that_lie_are_read_or_refused(file, count):
+    rng = np.random.default_rng(count)
+    points = np.array([[0, 0, 0], [1, 0, 0.5], [0, 1, 0.25], [1, 1, 0]], float)
+    kinds = ["char", "uchar", "short", "ushort", "int", "uint", "float", "double"]
+    numbers = ["0", "1", "3", "5", "-1", "1.5", "255", "65536", "2147483647", "4294967295", "1e9"]
+    read = 0
+    for number in range(count):
+        whole = ply_bytes(points, [(0, 1, 2, 3), (1, 2, 3)], FORMATS[number % 3], extra=True)
+        head, end, body = whole.partition(b"end_header\n")
+        words = head.decode().split(" ")
+        for _ in range(rng.integers(1, 4)):
+            at = rng.integers(len(words))
+            old, line, more = words[at].partition("\n")
+            pool = numbers if old.isdecimal() else kinds if old in kinds else kinds + numbers
+            words[at] = str(rng.choice(pool)) + line + more
+        data = bytearray(body)
+        for at in rng.integers(len(data), size=rng.integers(3)):
+            data[at] = rng.choice([0, 1, 48, 57, 127, 128, 255])
+        file.write_bytes(" ".join(words).encode() + end + data)
+        try:
+            mesh = read_ply(file)
+        except SourceError as error:
+            assert len(str(error)) < 500
+            continue
+        read += 1
+        assert np.isfinite(mesh.points).all()
+        assert mesh.triangles.size == 0 or mesh.triangles.max() < len(mesh.points)
+    assert 0 < read < count
 
 
 def test_windows_line_ends_are_read(file):
