@@ -99,10 +99,9 @@ class OniReader(DepthSource):
             self._file = None
 
     def _sentence(self, damage: str) -> str:
-        return (
-            f"'{self.uri}' cannot be read beyond frame {len(self._frames)} ({damage})."
-            " `selective-depth check` says what can be saved."
-        )
+        count = len(self._frames)
+        what = f"cannot be read beyond frame {count}" if count else "has no readable frame"
+        return f"'{self.uri}' {what} ({damage}). `selective-depth check` says what can be saved."
 
 
 def _trusted_frames(report: OniReport) -> tuple[list[OniFrame], str | None]:

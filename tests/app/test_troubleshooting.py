@@ -62,7 +62,7 @@ PROVOKED: dict[str, Provoke] = {
     "The OpenNI2 runtime … was not found": no_runtime,
     "OpenNI2 finds no depth sensor": lambda folder, patch: ["live", "--headless"],
     "There is no sensor '…'": lambda folder, patch: ["live", "nowhere", "--headless"],
-    "'…' is no whole recording": text_as_recording,
+    "'…' has no readable frame": text_as_recording,
     "no depth frames in '…'": lambda folder, patch: ["replay", str(folder), "--headless"],
     "… is an 8-bit grey PNG": eight_bits,
     "… pixels, but this recording is …": two_sizes,
