@@ -125,6 +125,9 @@ class AcquireOptions:
     """Further measurements as a share of the frame's pixels, 0..1; 0 takes none."""
     rounds: Rounds = 2
     """Rounds in which they are taken, each knowing what the last one found."""
+    by: Annotated[str, arg(metavar="NAME")] = "auto"
+    """What drives the shots: auto (the best there is), surface, step, improvement, neural-gas,
+    neural-gas-edges, even, or FILE.py:NAME, a selector of your own."""
 
 
 @dataclass(frozen=True)

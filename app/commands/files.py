@@ -19,6 +19,8 @@ from selective_depth.drivers.open import open_source
 from selective_depth.drivers.source import DepthSource
 
 MOST_PROBLEMS = 20
+OTHER_FILES = (".npz", ".npy", ".png", ".rrd", ".ply", ".bag", ".mcap", ".pdf", ".svg", ".webp")
+"""Endings of files that a folder's name must not have by mistake."""
 
 
 def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
@@ -65,13 +67,19 @@ def export(source: str, out: Path, frames: int | None) -> int:
     """
     if frames is not None and frames <= 0:
         raise UsageError(f"--frames is {frames}; it must be more than 0.")
+    ending = out.suffix.lower()
+    if ending in OTHER_FILES:
+        raise UsageError(
+            f"'{out}' ends in {ending}, which export does not write; give the name of a folder, for"
+            " PNG files, or one that ends in .oni."
+        )
+    recording, to_oni = Path(source).suffix.lower() == ".oni", ending == ".oni"
     with FrameProgress(f"Writing {out}", frames) as progress:
-        to_oni = out.suffix.lower() == ".oni"
-        if Path(source).suffix.lower() == ".oni" and frames is None:
-            if to_oni:
-                count = repair_oni(source, out).readable_frames
-            else:
-                count = export_oni(source, out, progress.update).readable_frames
+        if recording and to_oni and frames is None:
+            count = repair_oni(source, out).readable_frames
+        elif recording and not to_oni:
+            readable = export_oni(source, out, progress.update, frames=frames).readable_frames
+            count = readable if frames is None else min(readable, frames)
         else:
             with open_source(source) as opened:
                 if opened.frame_count is None and frames is None:
@@ -79,6 +87,14 @@ def export(source: str, out: Path, frames: int | None) -> int:
                         f"'{source}' never ends; say how many frames to save, as in --frames 100."
                     )
                 count = _save(opened, out, to_oni, frames, progress)
+                camera = opened.camera
+            middle = (camera.width / 2, camera.height / 2)
+            if to_oni and (abs(camera.cx - middle[0]) > 0.01 or abs(camera.cy - middle[1]) > 0.01):
+                say(
+                    f"note: .oni files store no principal point: that of '{out}' is the image's"
+                    f" middle ({middle[0]:g}, {middle[1]:g}), not ({camera.cx:g}, {camera.cy:g})."
+                    " A folder keeps it."
+                )
     say(f"wrote {out}: {count} frames")
     return OK
 
@@ -133,5 +149,5 @@ def _verdict(report: OniReport) -> str:
     if report.openable:
         return "it is incomplete, but can be replayed as far as it goes"
     if not report.version:
-        return "it is no recording"
-    return "it is damaged: OpenNI2 must not be given this file"
+        return "it is not an .oni recording"
+    return "it is damaged; it is replayed up to the damage"

@@ -176,7 +176,7 @@ class Session:
             live=self.report.live,
             times=pipeline.times,
             frames=frames,
-            title=self._uri + " acquired" * (self.settings.acquire.budget > 0),
+            title=f"{Path(self._uri).name} {self._driven_by()}",
             fallback=Path("out", "live.rrd" if self._uri.startswith("openni") else "replay.rrd"),
         )
         self.settings = dataclasses.replace(self.settings, viewer=viewer.options)
@@ -185,6 +185,11 @@ class Session:
         if viewer.served_url:
             say(f"Serving; join with '{join_command(viewer.served_url)}'.")
         return viewer
+
+    def _driven_by(self) -> str:
+        """What drives the shots; empty without a budget."""
+        spend = self.settings.acquire
+        return f"by {spend.by}" if spend.budget else ""
 
     def _flow(
         self, source: DepthSource, pipeline: Pipeline, viewer: Viewer, progress: FrameProgress

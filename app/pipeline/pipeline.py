@@ -15,13 +15,14 @@ import numpy as np
 
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline.result import FrameResult, Model
+from selective_depth.app.pipeline.selecting import gas_of, improvement_of, selector_of
 from selective_depth.app.pipeline.timing import StageTimes
 from selective_depth.app.pipeline.warm_up import compiling_beside
 from selective_depth.app.settings import Settings
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import Acquisition, acquire
-from selective_depth.selectors.improvement import ImprovementSelection, ImprovementSelector
-from selective_depth.selectors.neural_gas import NeuralGasSelector, RegionSelection
+from selective_depth.selectors.improvement import ImprovementSelection
+from selective_depth.selectors.neural_gas import RegionSelection
 from selective_depth.selectors.seeds import SeedGrid
 
 MODEL_EVERY = 10
@@ -62,26 +63,16 @@ class Pipeline:
     """
 
     def __init__(self, settings: Settings, *, realtime: bool = False) -> None:
-        gas, improvement = settings.gas, settings.improvement
         self._overlap = int(settings.acquire.budget > 0 or not realtime)
         self._threads = settings.run.threads or (1 if self._overlap else None)
         self.times = StageTimes()
         self._settings = settings
-        self._live_gas = gas.training == "live"
+        self._live_gas = settings.gas.training == "live"
         with _as_options("gas"):
-            self._gas = NeuralGasSelector(
-                nodes=gas.nodes,
-                epochs=gas.epochs,
-                algorithm=gas.algorithm,
-                seed=gas.seed,
-                edge_metric=gas.edge_metric,
-                factor=gas.factor,
-                threads=self._threads,
-            )
+            self._gas = gas_of(settings, self._threads)
         with _as_options("improvement"):
-            self._improvement = ImprovementSelector(
-                share=improvement.share, exponent=improvement.exponent, threads=self._threads
-            )
+            self._improvement = improvement_of(settings, self._threads)
+        self._selector = selector_of(settings, self._threads)
         self._realtime = realtime
         # The stages are compiled and free of the GIL: side by side they take as long as the
         # longest of them.
@@ -185,6 +176,7 @@ class Pipeline:
                 seeds,
                 options.budget,
                 rounds=options.rounds,
+                selector=self._selector,
                 threads=self._threads,
             )
         model = None if self._realtime else self._model(frame, acquisition, stages_ms)

@@ -55,6 +55,8 @@ class RunReport:
         Frames lost since then.
     state : str
         The sensor's at the end.
+    by : str
+        What drove the shots; empty without a budget.
     """
 
     source: str
@@ -66,6 +68,7 @@ class RunReport:
     missed: dict[str, int] = field(default_factory=dict)
     stages: dict[str, StageSummary] = field(default_factory=dict)
     state: str = ""
+    by: str = ""
     samples: Mean = field(default_factory=Mean)
     quantisation_error_mm: Mean = field(default_factory=Mean)
     rmse_mm: Mean = field(default_factory=Mean)
@@ -82,6 +85,8 @@ class RunReport:
         self.frames += 1
         self.samples.add(result.samples)
         self.quantisation_error_mm.add(result.regions.quantisation_error_mm)
+        if result.acquisition is not None:
+            self.by = result.acquisition.by
         if result.model is not None:
             self.rmse_mm.add(result.model.rmse_mm)
 
@@ -110,6 +115,8 @@ def print_report(report: RunReport) -> None:
     table.add_row("samples with depth", f"{report.samples.value:,.0f}", "per frame")
     if report.quantisation_error_mm.count:
         table.add_row("quantisation error", f"{report.quantisation_error_mm.value:.1f}", "mm")
+    if report.by:
+        table.add_row("shots chosen by", report.by, "")
     if report.rmse_mm.count:
         table.add_row("model RMSE", f"{report.rmse_mm.value:.1f}", "mm")
     console.print(table)

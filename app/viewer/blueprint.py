@@ -10,7 +10,7 @@ from selective_depth.app.pictures import palette as legend
 
 def blueprint(
     *,
-    acquiring: bool,
+    by: str | None,
     detail: bool,
     look_at_m: float = 2.0,
     limits_mm: tuple[float, float] = (500.0, 5000.0),
@@ -19,8 +19,8 @@ def blueprint(
 
     Parameters
     ----------
-    acquiring : bool
-        Whether a budget is spent: samples, model and error have views only then.
+    by : str or None
+        What drives the shots, if a budget is spent: samples, model and error have views only then.
     detail : bool
         Whether the inner read-outs have views too.
     look_at_m : float, default 2.0
@@ -42,10 +42,10 @@ def blueprint(
         ),
     ]
     space = ["/camera", "/camera/depth", "/world/nodes", "/world/regions"]
-    if acquiring:
+    if by is not None:
         columns.append(
             rrb.Vertical(
-                _image("4 Acquired", "samples", "holes"),
+                _image(f"4 Acquired by {by}", "samples", "holes"),
                 rrb.Tabs(_image("5 Error", "error", "holes"), _image("5 Model", "model")),
             )
         )

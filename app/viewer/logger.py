@@ -86,7 +86,7 @@ class StepLogger:
         far = far if options.far_mm is None else options.far_mm
         self._limits_mm = (float(near), float(max(far, near + 1)))
         layout = blueprint(
-            acquiring=step.acquisition is not None,
+            by=None if step.acquisition is None else step.acquisition.by,
             detail=options.detail,
             look_at_m=_middle_m(step.frame.depth_mm),
             limits_mm=self._limits_mm,

@@ -58,7 +58,7 @@ class Recording:
         self._stream.set_sinks(target)
         # The SDK imports half of what it needs at first use, which takes it up to a second:
         # that is now, and not while the first frames come.
-        blueprint(acquiring=True, detail=True)
+        blueprint(by="", detail=True)
         self._logger = StepLogger(self._stream, options)
 
     @classmethod

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -113,7 +114,11 @@ def mend_oni(path: str | Path) -> int:
 
 
 def export_oni(
-    path: str | Path, folder: str | Path, progress: Callable[[int], None] | None = None
+    path: str | Path,
+    folder: str | Path,
+    progress: Callable[[int], None] | None = None,
+    *,
+    frames: int | None = None,
 ) -> OniReport:
     """Save every readable depth frame of an .oni file, damaged or not, as a folder of PNG files.
 
@@ -125,11 +130,13 @@ def export_oni(
         The folder; made if it is not there. It must not hold PNG files yet.
     progress : callable, optional
         Called with the number of frames saved so far.
+    frames : int, optional
+        Save only so many, the first ones.
 
     Returns
     -------
     OniReport
-        Of the .oni file; its `readable_frames` were saved.
+        Of the .oni file; its `readable_frames`, or the first of them, were saved.
 
     Raises
     ------
@@ -145,7 +152,8 @@ def export_oni(
     assert depth is not None and camera is not None
     with open_regular(report.path) as file, FolderWriter(folder, fps=report.fps) as out:
         times_us = _mended_times(depth.frames)
-        for index, (frame, time_us) in enumerate(zip(depth.frames, times_us, strict=True)):
+        pairs = zip(depth.frames, times_us, strict=True)
+        for index, (frame, time_us) in enumerate(islice(pairs, frames)):
             depth_mm = decode_depth(
                 depth.codec, read_payload(file, frame), camera.height, camera.width
             )

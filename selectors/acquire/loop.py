@@ -53,6 +53,8 @@ class Acquisition:
         Height and width of the frame in pixels.
     rounds : tuple of Round
         Summary of each round after the seeds.
+    by : str
+        Name of the selector that chose the shots.
     plan : SurfacePlan or None
         What chose the shots, where that has made the model on its way.
     """
@@ -62,6 +64,7 @@ class Acquisition:
     round: npt.NDArray[np.uint8]
     frame_shape: tuple[int, int]
     rounds: tuple[Round, ...]
+    by: str = ""
     plan: SurfacePlan | None = None
 
     @property
@@ -184,7 +187,8 @@ def acquire(
         raise ValueError(f"shots is {shots}; give between 0 and the number of the frame's pixels")
     even_uv, pitch_px = finer_lattice(seeds, total if rounds > 1 else 0)
     samples = Samples.of(seeds, pitch_px)
-    plan = plan_of(selector or best_selector(rounds, threads), samples, threads)
+    chosen_by = selector or best_selector(rounds, threads)
+    plan = plan_of(chosen_by, samples, threads)
     lattice_mm = seeds.depth_mm.ravel()
     uv, depth = [seeds.lattice_uv.reshape(-1, 2)], [lattice_mm]
     whole = _fits_16_bits(lattice_mm) and bool((lattice_mm % 1 == 0).all())
@@ -208,6 +212,7 @@ def acquire(
         np.repeat(np.arange(len(uv), dtype=np.uint8), counts),
         seeds.frame_shape,
         tuple(made),
+        getattr(chosen_by, "name", getattr(chosen_by, "__name__", "")),
         plan if isinstance(plan, SurfacePlan) else None,
     )
 

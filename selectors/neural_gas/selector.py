@@ -71,6 +71,8 @@ class NeuralGasSelector:
     in Machine Perception", section III, eq. (1)-(4).
     """
 
+    name = "neural gas"
+
     def __init__(
         self,
         nodes: int = 2800,

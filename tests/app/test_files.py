@@ -6,11 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
 from selective_depth.app.cli import run
-from selective_depth.drivers.folder import RecordedFolder
+from selective_depth.app.commands.files import export
+from selective_depth.app.console.errors import UsageError
+from selective_depth.drivers.folder import RecordedFolder, write_folder
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.oni import OniReader, inspect_oni, write_oni
+from selective_depth.drivers.open import open_source
 from selective_depth.drivers.source import DepthSource
 
 
@@ -150,3 +154,34 @@ def test_export_refuses_in_one_line(
     printed = capsys.readouterr()
     assert message in printed.err
     assert printed.err.count("\n") == 1
+
+
+def test_a_damaged_recording_is_exported_alike_with_and_without_a_number(tmp_path: Path) -> None:
+    data = bytearray((ROOT / "recordings" / "workstation.oni").read_bytes())
+    report = inspect_oni(ROOT / "recordings" / "workstation.oni")
+    assert report.depth is not None
+    data[report.depth.frames[25].record_offset] ^= 0xFF
+    damaged = tmp_path / "damaged.oni"
+    damaged.write_bytes(data)
+    assert export(str(damaged), tmp_path / "all", None) == 0
+    assert export(str(damaged), tmp_path / "some", 28) == 0
+    with open_source(tmp_path / "all") as every, open_source(tmp_path / "some") as some:
+        assert (every.frame_count, some.frame_count) == (29, 28)
+
+
+@pytest.mark.parametrize("name", ["out.npz", "out.PNG", "out.mcap"])
+def test_a_file_that_export_does_not_write_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UsageError, match=r"name of a folder.*ends in \.oni"):
+        export("virtual:ball", tmp_path / name, 1)
+    assert not (tmp_path / name).exists()
+
+
+def test_a_principal_point_that_is_lost_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = Camera(64, 48, 60.0, 60.0, 30.0, 24.0)
+    write_folder(tmp_path / "in", [DepthFrame(np.ones((48, 64), np.uint16), 0, 0, camera)])
+    assert export(str(tmp_path / "in"), tmp_path / "out.oni", None) == 0
+    assert "not (30, 24)" in capsys.readouterr().out
+    assert export("virtual:ball?size=64x48&frames=1", tmp_path / "b.oni", None) == 0
+    assert "principal point" not in capsys.readouterr().out

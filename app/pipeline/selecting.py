@@ -1,0 +1,105 @@
+"""Which selector drives the shots: by name, or a function of one's own from a file."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+from selective_depth.app.console.errors import UsageError
+from selective_depth.app.settings import Settings
+from selective_depth.selectors.acquire import StepSelector, SurfaceSelector, best_selector
+from selective_depth.selectors.even import EvenSelector
+from selective_depth.selectors.improvement import ImprovementSelector
+from selective_depth.selectors.neural_gas import LongEdgeSelector, NeuralGasSelector
+from selective_depth.selectors.selection import Selector, Worth
+
+NAMES = ("auto", "surface", "step", "improvement", "neural-gas", "neural-gas-edges", "even")
+"""What ``--by`` takes, besides FILE.py:NAME."""
+
+
+def gas_of(settings: Settings, threads: int | None) -> NeuralGasSelector:
+    """The neural gas that the options describe."""
+    gas = settings.gas
+    return NeuralGasSelector(
+        nodes=gas.nodes,
+        epochs=gas.epochs,
+        algorithm=gas.algorithm,
+        seed=gas.seed,
+        edge_metric=gas.edge_metric,
+        factor=gas.factor,
+        threads=threads,
+    )
+
+
+def improvement_of(settings: Settings, threads: int | None) -> ImprovementSelector:
+    """The improvement map that the options describe."""
+    options = settings.improvement
+    return ImprovementSelector(share=options.share, exponent=options.exponent, threads=threads)
+
+
+def selector_of(settings: Settings, threads: int | None) -> Selector | Worth:
+    """The selector that ``--by`` names.
+
+    Parameters
+    ----------
+    settings : Settings
+        Options of a run; `acquire.by` is one of `NAMES`, or ``FILE.py:NAME``, a selector or a
+        function from samples to a worth for every pixel.
+    threads : int or None
+        Kernel threads.
+
+    Raises
+    ------
+    UsageError
+        If there is no such selector.
+    """
+    by = settings.acquire.by
+    if by == "auto":
+        return best_selector(settings.acquire.rounds, threads)
+    if by == "surface":
+        return SurfaceSelector(threads=threads)
+    if by == "step":
+        return StepSelector(threads=threads)
+    if by == "improvement":
+        return improvement_of(settings, threads)
+    if by == "neural-gas":
+        return gas_of(settings, threads)
+    if by == "neural-gas-edges":
+        return LongEdgeSelector(gas_of(settings, threads))
+    if by == "even":
+        return EvenSelector()
+    return _of_ones_own(by)
+
+
+def _of_ones_own(by: str) -> Selector | Worth:
+    """A selector out of a Python file, which is run for it."""
+    file, colon, name = by.rpartition(":")
+    path = Path(file)
+    if not colon or path.suffix != ".py":
+        raise UsageError(
+            f"--by is '{by}'; it must be one of {', '.join(NAMES)}, or FILE.py:NAME, a selector of"
+            " your own."
+        )
+    if not path.is_file():
+        raise UsageError(f"--by is '{by}', but there is no file '{file}'; check its name.")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None  # it ends in .py
+    module = importlib.util.module_from_spec(spec)
+    sys.modules.setdefault(path.stem, module)  # for dataclasses, which look their module up
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise UsageError(
+            f"--by is '{by}', but '{file}' fails: {type(error).__name__}: {error}."
+        ) from error
+    found: Any = getattr(module, name, None)
+    if isinstance(found, type):  # a class: its instances are the selectors
+        found = found()
+    if not (callable(found) or isinstance(found, Selector)):
+        raise UsageError(
+            f"--by is '{by}', but '{file}' has no function or selector '{name}'; define"
+            f" {name}(samples), which returns a worth for every pixel."
+        )
+    return found  # type: ignore[no-any-return]
