@@ -9,14 +9,12 @@ from tyro.conf import arg
 
 from selective_depth.app.console.command import PROGRAM, command
 from selective_depth.app.settings import (
-    Count,
+    ComparisonOptions,
     EvaluationFiles,
     Flag,
     Limit,
     PictureOptions,
-    Rounds,
     SeedOptions,
-    Share,
     optional,
 )
 
@@ -24,7 +22,13 @@ Source = Annotated[str, arg(metavar="SOURCE")]
 SourceOrSample = Annotated[str | None, optional("SOURCE")]
 Page = Annotated[PictureOptions, arg(name="")]
 Files = Annotated[EvaluationFiles, arg(name="")]
-SEEDS, PAGE, FILES = SeedOptions(), PictureOptions(), EvaluationFiles()
+Compared = Annotated[ComparisonOptions, arg(name="")]
+SEEDS, PAGE, FILES, COMPARED = (
+    SeedOptions(),
+    PictureOptions(),
+    EvaluationFiles(),
+    ComparisonOptions(),
+)
 
 
 @command(
@@ -96,19 +100,15 @@ def bench(
         f"{PROGRAM} evaluate frames/ --budget 0.05 0.10 --json out.json --picture out.png",
         "with a file of all figures and a picture",
     ),
+    (f"{PROGRAM} evaluate frames/ --strategies all", "every selector, in one shot and in the loop"),
     (f"{PROGRAM} evaluate frames/ --seeds.rows 64 --seeds.columns 64", "a coarser seed lattice"),
     (f"{PROGRAM} evaluate 'virtual:workstation?noise=off'", "where the truth is exact"),
 )
 def evaluate(
     sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
-    every: Count = 20,
-    frames: Limit = None,
-    budget: Annotated[tuple[Share, ...], arg(metavar="SHARE...")] = (0.05, 0.10),
-    rounds: Rounds = 8,
+    comparison: Compared = COMPARED,
     seeds: SeedOptions = SEEDS,
-    random_seeds: Count = 3,
-    jobs: Limit = None,
     files: Files = FILES,
     page: Page = PAGE,
 ) -> None:
@@ -118,20 +118,10 @@ def evaluate(
     ----------
     sources : tuple of str
         Recordings, folders or scenes, as for replay.
-    every : int
-        Take every N-th frame.
-    frames : int
-        Take at most N frames of each source.
-    budget : tuple of float
-        Further measurements as shares of the frame's pixels.
-    rounds : int
-        Rounds of the closed loops.
+    comparison
+        What is compared on what.
     seeds
         The seed lattice.
-    random_seeds : int
-        How often strategies that draw at random are run.
-    jobs : int
-        Processes; by default one per processor.
     files
         What is written.
     page
@@ -139,15 +129,4 @@ def evaluate(
     """
     from selective_depth.app.evaluation.report import run_evaluation
 
-    run_evaluation(
-        sources,
-        every=every,
-        frames=frames,
-        budgets=budget,
-        rounds=rounds,
-        seeds_shape=(seeds.rows, seeds.columns),
-        random_seeds=random_seeds,
-        jobs=jobs,
-        files=files,
-        page=page,
-    )
+    run_evaluation(sources, comparison, (seeds.rows, seeds.columns), files=files, page=page)

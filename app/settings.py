@@ -181,6 +181,26 @@ class PictureOptions:
 
 
 @dataclass(frozen=True)
+class ComparisonOptions:
+    """What is compared on what."""
+
+    every: Count = 20
+    """Take every N-th frame."""
+    frames: Limit = None
+    """Take at most N frames of each source."""
+    budget: Annotated[tuple[Share, ...], arg(metavar="SHARE...")] = (0.05, 0.10)
+    """Further measurements as shares of the frame's pixels."""
+    rounds: Rounds = 8
+    """Rounds of the closed loops."""
+    strategies: Annotated[tuple[str, ...], arg(metavar="NAME...")] = ("main",)
+    """What is compared: main, all, or names out of the table; uniform and oracle always are."""
+    random_seeds: Count = 3
+    """How often strategies that draw at random are run."""
+    jobs: Limit = None
+    """Processes; by default one per processor."""
+
+
+@dataclass(frozen=True)
 class EvaluationFiles:
     """Where an evaluation is written, besides the terminal."""
 

@@ -21,12 +21,12 @@ from selective_depth.app.evaluation.evaluate import (
     outcomes,
     summarise,
 )
-from selective_depth.app.evaluation.strategies import STRATEGIES, Case
+from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of
 from selective_depth.app.pictures import Panel, sheet, write_picture
 from selective_depth.app.pictures.panels import error_panel, shots_panel
 from selective_depth.app.pictures.sheets import WIDTH_IN
 from selective_depth.app.pipeline import say
-from selective_depth.app.settings import EvaluationFiles, PictureOptions
+from selective_depth.app.settings import ComparisonOptions, EvaluationFiles, PictureOptions
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.reconstruct import reconstruct
@@ -40,21 +40,16 @@ TITLES = {
     "improvement": "Published, one shot",
     "gradient": "Gradient, one shot",
     "step": "Step score, one shot",
-    "loop": "Step score, closed loop",
+    "loop": "Surface score, closed loop",
     "oracle": "Oracle",
 }
 
 
 def run_evaluation(
     sources: Sequence[str],
-    *,
-    every: int,
-    frames: int | None,
-    budgets: Sequence[float],
-    rounds: int,
+    options: ComparisonOptions,
     seeds_shape: tuple[int, int],
-    random_seeds: int,
-    jobs: int | None,
+    *,
     files: EvaluationFiles,
     page: PictureOptions,
 ) -> Results:
@@ -63,20 +58,23 @@ def run_evaluation(
     Raises
     ------
     UsageError, OutputError
-        If a file cannot be written; found out before the work is done where possible.
+        If there is no such strategy or a file cannot be written; found out before the work is done
+        where possible.
     """
     check_picture(files.picture)
     check_output(files.json, files.page)
+    budgets, rounds = options.budget, options.rounds
     with FrameProgress("Evaluating", None) as bar:
         found = outcomes(
             sources,
-            every=every,
-            frames=frames,
+            every=options.every,
+            frames=options.frames,
             budgets=budgets,
             rounds=rounds,
             seeds_shape=seeds_shape,
-            random_seeds=random_seeds,
-            jobs=jobs,
+            random_seeds=options.random_seeds,
+            strategies=strategies_of(options.strategies),
+            jobs=options.jobs,
             progress=lambda done, total: bar.update(done, f"of {total}"),
         )
     results = summarise(found)
@@ -88,7 +86,7 @@ def run_evaluation(
     if files.page is not None:
         write_output(files.page, to_markdown(found))
     if files.picture is not None:
-        frame = next(frames_of(sources, every, 1))
+        frame = next(frames_of(sources, options.every, 1))
         shown = comparison(
             frame, budgets[0], rounds=rounds, seeds_shape=seeds_shape, width_in=page.width
         )
@@ -132,7 +130,7 @@ def print_results(results: Results, frames: int, rounds: int) -> None:
                 f"{row['mae_mm']:.2f}",
                 f"{row['wrong']:.2%}",
                 f"{row['missed']:.0%}",
-                style="bold" if name in ("step", "loop") else "",
+                style="bold" if name == "loop" else "",
             )
         console.print(shown)
 

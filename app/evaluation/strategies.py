@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.app.console.errors import UsageError
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.selectors.acquire import acquire
-from selective_depth.selectors.even import even_lattice, spread
+from selective_depth.selectors.acquire import StepSelector, SurfaceSelector, acquire
+from selective_depth.selectors.even import EvenSelector, even_lattice, spread
 from selective_depth.selectors.improvement import ImprovementSelection, ImprovementSelector
-from selective_depth.selectors.neural_gas import NeuralGasSelector, RegionSelection
+from selective_depth.selectors.neural_gas import (
+    LongEdgeSelector,
+    NeuralGasSelector,
+    RegionSelection,
+)
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
-from selective_depth.selectors.selection import Selector
+from selective_depth.selectors.selection import Selector, Worth
 
 Pixels = npt.NDArray[np.int32]
 ORACLE_BATCHES = 16
@@ -160,6 +165,35 @@ class Strategy:
     reference: bool = False
 
 
+def _slope_by_gap(samples: Samples) -> npt.NDArray[np.float32]:
+    """The three-line score that any other must beat: slope of the model times the gap."""
+    model_mm = reconstruct(samples.uv, samples.depth_mm, samples.frame_shape)
+    down, along = np.gradient(model_mm)
+    return np.asarray(np.hypot(down, along) * np.minimum(samples.gap_px(), 4), np.float32)
+
+
+SELECTORS: dict[str, tuple[str, Callable[[int], Selector | Worth], bool]] = {
+    "surface": ("surface score", lambda seed: SurfaceSelector(), False),
+    "step": ("step score", lambda seed: StepSelector(), False),
+    "gradient": ("slope of the model x gap", lambda seed: _slope_by_gap, False),
+    "improvement": ("published improvement", lambda seed: ImprovementSelector(), False),
+    "neural-gas": ("neural gas, published rule", lambda seed: NeuralGasSelector(seed=seed), True),
+    "neural-gas-edges": (
+        "neural gas, long edges",
+        lambda seed: LongEdgeSelector(NeuralGasSelector(seed=seed)),
+        True,
+    ),
+    "even": ("even fill", lambda seed: EvenSelector(), False),
+}
+"""Every selector that can drive an acquisition: what it is, how it is made, whether by chance.
+
+Each is compared in one shot and in the closed loop, as NAME/one-shot and NAME/loop."""
+
+
+def _selected(name: str, case: Case, rounds: int) -> Pixels:
+    return _loop(case, rounds, SELECTORS[name][1](case.seed))
+
+
 STRATEGIES: dict[str, Strategy] = {
     "uniform": Strategy("a fresh lattice", lambda c: c.lattice(len(c.seed_uv) + c.shots)),
     "random": Strategy("anywhere near a sample", _random, chance=True),
@@ -185,7 +219,7 @@ STRATEGIES: dict[str, Strategy] = {
     ),
     "gradient": Strategy("gradient of the interpolated depth, one shot", _gradient),
     "step": Strategy("step score, one shot", lambda c: _loop(c, 1)),
-    "loop": Strategy("step score, closed loop", lambda c: _loop(c, c.rounds)),
+    "loop": Strategy("surface score, closed loop: the default", lambda c: _loop(c, c.rounds)),
     "oracle": Strategy("largest true error, 16 batches", _oracle),
     "uniform_x3": Strategy(
         "a fresh lattice, 3 times the samples",
@@ -198,3 +232,32 @@ STRATEGIES: dict[str, Strategy] = {
         reference=True,
     ),
 }
+for _name, (_about, _, _chance) in SELECTORS.items():
+    STRATEGIES[f"{_name}/one-shot"] = Strategy(
+        f"{_about}, one shot", partial(_selected, _name, rounds=1), _chance
+    )
+    STRATEGIES[f"{_name}/loop"] = Strategy(
+        f"{_about}, closed loop", lambda c, name=_name: _selected(name, c, c.rounds), _chance
+    )
+
+
+def strategies_of(names: Sequence[str]) -> tuple[str, ...]:
+    """The strategies that are meant by names, by "main" (those without a "/") or by "all".
+
+    Raises
+    ------
+    UsageError
+        If there is no such strategy, naming those there are.
+    """
+    meant: list[str] = []
+    for name in names:
+        if name in ("main", "all"):
+            meant += [each for each in STRATEGIES if name == "all" or "/" not in each]
+        elif name in STRATEGIES:
+            meant.append(name)
+        else:
+            raise UsageError(
+                f"--strategies has '{name}'; it takes main, all, or names out of"
+                f" {', '.join(STRATEGIES)}."
+            )
+    return tuple(dict.fromkeys(meant))

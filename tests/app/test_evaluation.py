@@ -19,7 +19,7 @@ from selective_depth.app.console.exit_codes import FAILED, MISUSED, OK
 from selective_depth.app.evaluation import evaluate as protocol
 from selective_depth.app.evaluation.evaluate import Errors, Outcome, outcomes, summarise
 from selective_depth.app.evaluation.report import comparison, print_results, to_markdown
-from selective_depth.app.evaluation.strategies import STRATEGIES, Case
+from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of
 from selective_depth.app.pictures import palette
 from selective_depth.drivers.errors import OutputError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthFrame
@@ -319,7 +319,7 @@ def test_the_command_writes_table_file_and_picture(
     )
     printed = capsys.readouterr().out
     document = json.loads(out.read_text())
-    for name in STRATEGIES:
+    for name in strategies_of(["main"]):
         assert name in printed
         row = document["0.05"][name]
         assert {"geo", "worst", "share", "share_min", "rmse_mm", "mae_mm"} <= set(row)
@@ -416,3 +416,12 @@ def test_the_figures_of_the_documentation_hold(shared_data: Path) -> None:
     assert table["improvement"]["geo"] <= 0.41
     assert table["loop"]["rmse_mm"] < table["uniform_70"]["rmse_mm"]
     assert table["loop"]["mae_mm"] <= table["uniform_x3"]["mae_mm"]
+
+
+def test_strategies_are_named_by_groups_or_one_by_one() -> None:
+    every = strategies_of(["all"])
+    assert set(every) == set(STRATEGIES)
+    assert strategies_of(["improvement/loop", "main"])[0] == "improvement/loop"
+    assert {"neural-gas/one-shot", "neural-gas/loop", "gradient/loop"} <= set(every)
+    with pytest.raises(UsageError, match="'nope'; it takes main, all, or names"):
+        strategies_of(["nope"])

@@ -72,6 +72,7 @@ def test_a_source_without_end_needs_a_number(
 ) -> None:
     class Endless(DepthSource):
         live, dropped, frame_count, fps = True, 0, None, 30.0
+        camera = Camera.kinect(4, 4)
 
         def read(self, timeout_s: float = 5.0) -> DepthFrame:
             return DepthFrame(np.ones((4, 4), np.uint16), 0, 0, Camera.kinect(4, 4))
@@ -94,7 +95,7 @@ def test_check_of_what_is_no_recording(
     path = tmp_path / "not.oni"
     path.write_text(content)
     assert run(["check", str(path)]) == 1
-    assert "it is no recording" in capsys.readouterr().out
+    assert "it is not an .oni recording" in capsys.readouterr().out
 
 
 def test_check_of_a_missing_file_is_one_line(
@@ -133,7 +134,7 @@ def test_export_saves_what_is_readable_of_a_damaged_file(
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["walk.oni", "out", "--frames", "0"], 2, "--frames is 0; it must be more than 0"),
+        (["walk.oni", "out", "--frames", "0"], 2, "--frames is 0; it must be 1 or more"),
         (["none.oni", "out"], 1, "does not exist"),
         (["walk.oni", "walk.oni"], 1, "exists already"),
         (["walk.oni", "full"], 1, "holds frames already"),
