@@ -107,7 +107,7 @@ class Case:
         return self.best(spread(mask))
 
 
-def _loop(case: Case, rounds: int, selector: Selector | None = None) -> Pixels:
+def _loop(case: Case, rounds: int, selector: Selector | Worth | None = None) -> Pixels:
     return acquire(
         case.frame.measure, case.seeds, rounds=rounds, selector=selector, shots=case.shots
     ).uv
@@ -190,8 +190,8 @@ SELECTORS: dict[str, tuple[str, Callable[[int], Selector | Worth], bool]] = {
 Each is compared in one shot and in the closed loop, as NAME/one-shot and NAME/loop."""
 
 
-def _selected(name: str, case: Case, rounds: int) -> Pixels:
-    return _loop(case, rounds, SELECTORS[name][1](case.seed))
+def _selected(case: Case, name: str, *, loop: bool) -> Pixels:
+    return _loop(case, case.rounds if loop else 1, SELECTORS[name][1](case.seed))
 
 
 STRATEGIES: dict[str, Strategy] = {
@@ -233,12 +233,10 @@ STRATEGIES: dict[str, Strategy] = {
     ),
 }
 for _name, (_about, _, _chance) in SELECTORS.items():
-    STRATEGIES[f"{_name}/one-shot"] = Strategy(
-        f"{_about}, one shot", partial(_selected, _name, rounds=1), _chance
-    )
-    STRATEGIES[f"{_name}/loop"] = Strategy(
-        f"{_about}, closed loop", lambda c, name=_name: _selected(name, c, c.rounds), _chance
-    )
+    for _kind, _words in (("one-shot", "one shot"), ("loop", "closed loop")):
+        STRATEGIES[f"{_name}/{_kind}"] = Strategy(
+            f"{_about}, {_words}", partial(_selected, name=_name, loop=_kind == "loop"), _chance
+        )
 
 
 def strategies_of(names: Sequence[str]) -> tuple[str, ...]:
