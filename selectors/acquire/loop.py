@@ -153,8 +153,7 @@ def acquire(
     seeds : SeedGrid
         The first measurements; they are not part of the budget.
     budget : float, default 0.05
-        Share of the frame's pixels. A measurement that returns nothing is paid for as well.
-        (A whole number from 2 on is taken as `shots`.)
+        Share of the frame's pixels, misses paid for; a whole number from 2 on is taken as `shots`.
     rounds : int, default 8
         1 decides everything from the seeds. Where these are few and far apart, the first of
         several rounds makes their lattice finer (`finer_lattice`).
@@ -164,7 +163,7 @@ def acquire(
     shots : int, optional
         The budget as a number of measurements.
     threads : int, optional
-        Kernel threads of the default selector and of choosing; default `default_threads()`.
+        Kernel threads; default `default_threads()`.
 
     Returns
     -------
@@ -195,8 +194,8 @@ def acquire(
     made: list[Round] = []
     for due in _shares(total, rounds, len(even_uv)):
         left = due - sum(r.shots for r in made)
-        new_uv = even_uv if len(even_uv) and not made else plan.best(left)
-        new_uv = _allowed(new_uv, samples, left)
+        wanted = even_uv if len(even_uv) and not made else plan.best(left)
+        new_uv = _allowed(wanted, samples, left)
         answer, new_mm = answers(measure, new_uv)
         _refuse_metres(new_mm, samples)
         whole &= np.issubdtype(answer.dtype, np.integer) and _fits_16_bits(new_mm)
@@ -204,12 +203,11 @@ def acquire(
         uv.append(new_uv)
         depth.append(new_mm)
         made.append(Round(len(new_uv), int(np.count_nonzero(new_mm))))
-    counts = [len(part) for part in uv]
     depth_mm: npt.NDArray[np.float32] = np.concatenate(depth)
     return Acquisition(
         np.concatenate(uv),
         depth_mm.astype(np.uint16) if whole else depth_mm,
-        np.repeat(np.arange(len(uv), dtype=np.uint8), counts),
+        np.repeat(np.arange(len(uv), dtype=np.uint8), [len(part) for part in uv]),
         seeds.frame_shape,
         tuple(made),
         getattr(chosen_by, "name", getattr(chosen_by, "__name__", "")),

@@ -7,7 +7,7 @@ import numpy as np
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.improvement.lattice import LANES, krige_lanes
 from selective_depth.selectors.improvement.lattice_tables import SEEDS
-from selective_depth.selectors.improvement.systems import krige_window
+from selective_depth.selectors.improvement.systems import Box, krige_window
 from selective_depth.selectors.improvement.variogram import fit_samples
 
 LEVEL_SHIFT = np.uint32(17)
@@ -98,9 +98,10 @@ def krige_row(  # type: ignore[no-untyped-def]
         gathered = gather_seeds(padded, rows, columns, i, j, samples)
         geometry = row_shapes[i] * column_shape_count + column_shapes[j]
         a, b = fit_samples(z, row_of, gathered, between[geometry])
+        box = Box(columns[j] - lefts[j] + 1, rows[i] - up + 1, width, height)
         krige_window(
-            samples, gathered, a, b, between[geometry], distances, first_pixel[geometry],
-            columns[j] - lefts[j] + 1, rows[i] - up + 1, width, height, frame_shape, window_scratch,
+            samples, gathered, a, b, between[geometry], distances, first_pixel[geometry], box,
+            frame_shape, window_scratch,
         )  # fmt: skip
         for row in range(height):
             for column in range(width):
@@ -199,10 +200,13 @@ def near_seed(padded, rows, columns, i, j, y, x, reach_squared):  # type: ignore
 
 @njit(cache=True, forceinline=True, nogil=True)
 def mark_known(  # type: ignore[no-untyped-def]
-    y, i, padded, rows, columns, column_blend, places, reach_squared, held, doubtful, estimate,
-    variance, raw, known,
-):  # fmt: skip
-    """Tell known pixels of a row from those too far from every seed, and clear the latter."""
+    y, i, padded, rows, columns, column_blend, places, reach_squared, held, doubtful, line
+):
+    """Tell known pixels of a row from those too far from every seed, and clear the latter.
+
+    `line` is the pixel row y of the estimate, the variance, the improvement and what is known.
+    """
+    estimate, variance, raw, known = line
     _, _, _, _, first_weight, second_weight = column_blend
     first_place, second_place = places[0], places[1]
     known[:] = True
@@ -272,7 +276,7 @@ def improvement_rows(  # type: ignore[no-untyped-def]
             judged = above
         mark_known(
             y, above, padded, rows, columns, column_blend, places, reach_squared, held[0],
-            doubtful[:, :doubts], estimate[y], variance[y], raw[y], known[y],
+            doubtful[:, :doubts], (estimate[y], variance[y], raw[y], known[y]),
         )  # fmt: skip
         for x in range(frame_shape[1]):
             score[y, x] = raw[y, x] / (raw[y, x] + half)

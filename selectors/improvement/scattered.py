@@ -8,6 +8,7 @@ a lattice alone that is the same system as `ImprovementSelector` solves.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,7 @@ from selective_depth.selectors.arrays import checked_map, sample_pairs
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_over
 from selective_depth.selectors.improvement.systems import (
     MAX_SAMPLES,
+    Box,
     krige_window,
     sample_buffers,
     window_scratch,
@@ -93,6 +95,30 @@ def improvement_scattered(
     return map_scattered(measured, asked, windows_over(shape, over, exponent), threads)
 
 
+class _Work(NamedTuple):
+    """Working memory of a band of rows.
+
+    Attributes
+    ----------
+    samples : tuple
+        `sample_buffers`.
+    distances : float32 array of shape (MAX_SAMPLES, most pixels of a window)
+        Distance^w from each sample to the pixels of a window.
+    scratch : tuple
+        `window_scratch`.
+    sums : float32 array of shape (3, rows, W)
+        Estimate, variance and improvement, weighted and added up.
+    held : float32 array of shape (rows, W)
+        The weights.
+    """
+
+    samples: tuple[npt.NDArray[Any], ...]
+    distances: npt.NDArray[np.float32]
+    scratch: tuple[npt.NDArray[Any], ...]
+    sums: npt.NDArray[np.float32]
+    held: npt.NDArray[np.float32]
+
+
 def map_scattered(
     measured: npt.NDArray[np.float32],
     asked: npt.NDArray[np.bool_] | None,
@@ -111,14 +137,18 @@ def map_scattered(
     spiral = _spiral(windows.power.shape[0] // 2)
 
     def band(first_row: int, end_row: int) -> None:
+        work = _Work(
+            samples=sample_buffers(),
+            distances=np.zeros((MAX_SAMPLES, windows.most_pixels), np.float32),
+            scratch=window_scratch(windows.most_pixels),
+            sums=np.zeros((3, end_row - first_row, measured.shape[1]), np.float32),
+            held=np.zeros((end_row - first_row, measured.shape[1]), np.float32),
+        )
         _map_rows(
             first_row, end_row, measured, asked,
-            rows.centres, rows.before, rows.after, columns.centres, columns.before, columns.after,
-            windows.power, spiral, windows.reach_px**2,
-            sample_buffers(), np.zeros((MAX_SAMPLES, windows.most_pixels), np.float32),
-            window_scratch(windows.most_pixels),
-            np.zeros((3, end_row - first_row, measured.shape[1]), np.float32),
-            np.zeros((end_row - first_row, measured.shape[1]), np.float32),
+            (rows.centres, rows.before, rows.after),
+            (columns.centres, columns.before, columns.after),
+            windows.power, spiral, windows.reach_px**2, work,
             (result.estimate_mm, result.variance_mm2, result.raw, result.known),
         )  # fmt: skip
 
@@ -171,9 +201,42 @@ def _near_sample(measured, spiral, y, x, reach_squared):  # type: ignore[no-unty
 
 @njit(cache=True, nogil=True)
 def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
-    first_row, end_row, measured, asked, rows, up, down, columns, left, right, power, spiral,
-    reach_squared, samples, distances, scratch, sums, held, out,
+    first_row,
+    end_row,
+    measured,
+    asked,
+    row_axis,
+    column_axis,
+    power,
+    spiral,
+    reach_squared,
+    work,
+    out,
 ):  # fmt: skip
+    """Map the rows first_row..end_row where asked, each window kriged and blended into its cells.
+
+    Parameters
+    ----------
+    measured : float32 array of shape (H, W)
+        Depth of the samples in mm, 0 = none.
+    asked : bool array of shape (H, W)
+        Where the map is wanted.
+    row_axis, column_axis : tuple of int arrays
+        Centres of the windows, and how far each reaches before and after its centre, pixels.
+    power : float64 array of shape (2 r + 1, 2 r + 1)
+        Distance^w by difference of rows and columns.
+    spiral : int64 array of shape (n, 2)
+        Differences (row, column), the nearest first.
+    reach_squared : float
+        Pixels farther from every sample are not known, squared pixels.
+    work : _Work
+        Working memory of this band.
+    out : tuple of arrays of shape (H, W)
+        Estimate (mm), variance (mm^2), improvement and known.
+    """
+    rows, up, down = row_axis
+    columns, left, right = column_axis
+    samples, distances, scratch, sums, held = work
     estimate, variance, raw, known = out
     u, v, z, row_of = samples
     between = np.zeros((MAX_SAMPLES, MAX_SAMPLES))
@@ -207,10 +270,8 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
                     for x in range(start - 1, end + 1):
                         distances[n, p] = line[reach + x - u[n]]
                         p += 1
-            krige_window(
-                samples, count, a, b, between, distances, 0, start, top, width, height,
-                measured.shape, scratch,
-            )  # fmt: skip
+            box = Box(start, top, width, height)
+            krige_window(samples, count, a, b, between, distances, 0, box, measured.shape, scratch)
             for y in range(y0, y1):
                 gap = up[i] if y < rows[i] else down[i]
                 share_y = count * (1.0 - abs(y - rows[i]) / gap)

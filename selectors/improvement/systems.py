@@ -30,7 +30,7 @@ eq. (27): summing over five pixels costs less than its moments.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -93,6 +93,15 @@ def window_scratch(pixels: int) -> tuple[npt.NDArray[Any], ...]:
         np.zeros((MAX_SAMPLES, MAX_SAMPLES), np.float64),  # L, its diagonal inverted
         np.zeros(MAX_SAMPLES, np.float64),  # L^-1 (Z - z_ref)
     )
+
+
+class Box(NamedTuple):
+    """The pixels of a window: its first column and row, and its size."""
+
+    u0: int
+    v0: int
+    width: int
+    height: int
 
 
 def sample_buffers() -> tuple[npt.NDArray[Any], ...]:
@@ -167,7 +176,7 @@ def _solve_block(block, corner, pixels):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def krige_window(  # type: ignore[no-untyped-def]
-    samples, count, a, b, between, distances, first, u0, v0, width, height, frame_shape, scratch
+    samples, count, a, b, between, distances, first, box, frame_shape, scratch
 ):
     """Krige one window; results in the first three arrays of `scratch`.
 
@@ -182,9 +191,9 @@ def krige_window(  # type: ignore[no-untyped-def]
         Distance^w between samples.
     distances : float32 array of shape (rows, pixels)
         Distance^w to the window's pixels, from column `first` on, `padded_pixels` of them.
-    u0, v0, width, height : int
+    box : Box
         The window's pixels; results and distances are laid out with a rim of one pixel on
-        every side, row by row, `width` + 2 to a row.
+        every side, row by row, `box.width` + 2 to a row.
     frame_shape : tuple of int
         Pixels outside the frame are no neighbours.
     scratch : tuple
@@ -192,8 +201,8 @@ def krige_window(  # type: ignore[no-untyped-def]
     """
     z, row_of = samples[2], samples[3]
     estimate, variance, _, _, right, below, U, L, y = scratch
-    stride = width + 2
-    pixels = (stride * (height + 2) + VECTOR - 1) // VECTOR * VECTOR
+    stride = box.width + 2
+    pixels = (stride * (box.height + 2) + VECTOR - 1) // VECTOR * VECTOR
     scale, nugget = np.float32(a), np.float32(b)
     _factor(z, row_of, count, a, b, between, L, y)
 
@@ -258,13 +267,14 @@ def krige_window(  # type: ignore[no-untyped-def]
             c += block[2 * _STRIDE + p] * under[2 * _STRIDE + p]
             below[p] -= c + block[3 * _STRIDE + p] * under[3 * _STRIDE + p]
 
-    _improve(samples, count, u0, v0, width, height, frame_shape, scratch)
+    _improve(samples, count, box, frame_shape, scratch)
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _improve(samples, count, u0, v0, width, height, frame_shape, scratch):  # type: ignore[no-untyped-def]
+def _improve(samples, count, box, frame_shape, scratch):  # type: ignore[no-untyped-def]
     """Eq. (23) from estimates, variances and the covariances of neighbours."""
     u, v, z, _ = samples
+    u0, v0, width, height = box
     estimate, variance, improvement, inverse, right, below = scratch[:6]
     stride = width + 2
     pixels = (stride * (height + 2) + VECTOR - 1) // VECTOR * VECTOR

@@ -11,6 +11,7 @@ from reference_kriging import direct_improvement, gamma, krige
 from selective_depth.selectors.improvement.lattice_tables import build_tables
 from selective_depth.selectors.improvement.systems import (
     MAX_SAMPLES,
+    Box,
     krige_window,
     padded_pixels,
     sample_buffers,
@@ -37,7 +38,8 @@ def window(uv, depth, a, b, w, u0, v0, width, height):
         line = power[64 + v - uv[n, 1], 64 + u - uv[n, 0]].ravel()
         distances[n, : line.size] = line
     scratch = window_scratch(room)
-    krige_window(samples, count, a, b, between, distances, 0, u0, v0, width, height, FRAME, scratch)
+    box = Box(u0, v0, width, height)
+    krige_window(samples, count, a, b, between, distances, 0, box, FRAME, scratch)
     size = (height + 2) * (width + 2)
     return [
         scratch[q][:size].reshape(height + 2, width + 2)[1:-1, 1:-1].astype(float) for q in range(3)
