@@ -146,7 +146,7 @@ def _along_edge(
         a, b = b, a
     du, dv = uv[b, 0] - uv[a, 0], uv[b, 1] - uv[a, 1]
     step, whole = (u - uv[a, 0], du) if abs(du) >= abs(dv) else (v - uv[a, 1], dv)
-    return np.float32(z_mm[a] + (z_mm[b] - z_mm[a]) * np.float32(step) / np.float32(whole))
+    return np.float32(z_mm[a] + (z_mm[b] - z_mm[a]) * np.float64(step) / np.float64(whole))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -185,7 +185,7 @@ def _draw(
             du, dv = uv[end, 0] - uv[begin, 0], uv[end, 1] - uv[begin, 1]
             owned[k] = hull or dv > 0 or (dv == 0 and du > 0)
         area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)  # positive: they run anticlockwise
-        inverse = np.float32(1) / np.float32(area)
+        inverse = 1 / area
         left, right, top, bottom = (
             min(u0, u1, u2),
             max(u0, u1, u2),
