@@ -113,7 +113,9 @@ class ImprovementOptions:
 
     share: Share = 0.10
     """Share of the known pixels that the mask selects."""
-    exponent: Annotated[float, must_be("between 0 and 2", float, lambda w: 0 < w < 2)] = 1.2
+    exponent: Annotated[
+        float, must_be("more than 0, at most 1.9999", float, lambda w: 0 < w <= 1.9999)
+    ] = 1.2
     """Exponent w = 2 - epsilon of the semivariogram, eq. (24)."""
 
 

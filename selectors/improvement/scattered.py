@@ -29,6 +29,9 @@ from selective_depth.selectors.parallel import in_bands
 EXPONENT = 1.2
 """The exponent w = 2 - epsilon of the semivariogram (eq. 24); see `app/docs/improvement.md`."""
 
+MOST_EXPONENT = 1.9999
+"""Nearer to 2 the kriging variance vanishes beside the rounding of single precision."""
+
 
 @dataclass(frozen=True, eq=False)
 class ImprovementMap:

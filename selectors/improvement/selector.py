@@ -22,7 +22,7 @@ from selective_depth.selectors.improvement.map import (
     improvement_rows,
 )
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_of
-from selective_depth.selectors.improvement.scattered import EXPONENT, map_scattered
+from selective_depth.selectors.improvement.scattered import EXPONENT, MOST_EXPONENT, map_scattered
 from selective_depth.selectors.improvement.systems import (
     aligned_zeros,
     sample_buffers,
@@ -93,10 +93,10 @@ class ImprovementSelector:
     ) -> None:
         if not 0 <= share <= 1:
             raise ValueError(f"share is {share}; it is a part of all pixels, 0..1")
-        if not 0 < exponent < 2:
+        if not 0 < exponent <= MOST_EXPONENT:
             raise ValueError(
-                f"exponent is {exponent}; a semivariogram a h^w needs 0 < w < 2 (the paper's"
-                " w = 2 makes singular systems)"
+                f"exponent is {exponent}; give more than 0 and at most {MOST_EXPONENT} (w = 2 makes"
+                " singular systems, and nearer to it single precision leaves only rounding)"
             )
         self.share = share
         self.exponent = exponent

@@ -404,3 +404,19 @@ def test_best_tenth_holds_the_interpolation_error(shared_data, step):
     for name, held in (("improvement", shares), ("gradient", gradient_shares)):
         print(f"{name}: {np.mean(held):.4f}, least {np.min(held):.4f}")
     assert np.mean(shares) >= 0.95
+
+
+@pytest.mark.parametrize("exponent", [0.0, -1.0, 1.99999, 2.0, np.nan])
+def test_an_exponent_that_leaves_only_rounding_is_refused(exponent):
+    with pytest.raises(ValueError, match="give more than 0 and at most"):
+        ImprovementSelector(exponent=exponent)
+
+
+def test_the_greatest_exponent_still_gives_a_map(shared_data):
+    depth = cv2.imread(str(shared_data / "sequence" / "000040.png"), cv2.IMREAD_UNCHANGED)
+    seeds = SeedGrid.from_array(depth, (64, 64))
+    near, nearest = (ImprovementSelector(exponent=w).select(seeds) for w in (1.999, 1.9999))
+    assert np.isfinite(nearest.raw).all() and (nearest.raw >= 0).all()
+    both = near.known & nearest.known
+    order = [np.argsort(np.argsort(each.raw[both])) for each in (near, nearest)]
+    assert np.corrcoef(*order)[0, 1] > 0.99

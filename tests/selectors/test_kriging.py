@@ -74,7 +74,9 @@ def test_window_equals_the_published_systems(system):
     pixels = np.stack((u.ravel(), v.ravel()), axis=1)
     _, expected_z, expected_variance = krige(uv, depth.astype(float), pixels, a, b, w)
     floor = depth.min() / 2
-    np.testing.assert_allclose(z.ravel(), np.maximum(expected_z, floor), rtol=3e-4)
+    # Single precision, of what the depths differ by.
+    off_mm = 1e-3 * np.ptp(depth) + 1e-4 * depth.min()
+    np.testing.assert_allclose(z.ravel(), np.maximum(expected_z, floor), rtol=0, atol=off_mm)
     tolerance = 1e-3 * expected_variance.max()
     np.testing.assert_allclose(
         variance.ravel(), expected_variance, rtol=1e-3, atol=1e-3 * tolerance + 1e-9
