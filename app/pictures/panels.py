@@ -145,7 +145,7 @@ def shots_panel(
 def samples_panel(frame: DepthFrame, acquisition: Acquisition) -> Panel:
     """Where the budget went, by round."""
     share = float((acquisition.round > 0).sum()) / frame.depth_mm.size
-    caption = f"Acquired by {acquisition.by}: {share:.1%} more"
+    caption = f"{share:.1%} more by {acquisition.by}"
     return shots_panel(frame, acquisition.uv, acquisition.round, caption)
 
 

@@ -66,8 +66,8 @@ def test_near_is_darker_than_far_as_in_the_viewer(row: StillRow) -> None:
 
 def test_a_scale_is_linear_between_its_limits_and_dark_where_nothing_is_known() -> None:
     colours = palette.channels(palette.palette(palette.ERROR.colormap))
-    shown = palette.ERROR.colour(np.array([-5.0, 0.0, 50.0, 100.0, 1e9, np.nan]))
-    np.testing.assert_array_equal(shown, colours[[0, 0, 128, 255, 255, 0]])
+    shown = palette.ERROR.colour(np.array([-5.0, 0.0, 20.0, 100.0, 1e9, np.nan]))
+    np.testing.assert_array_equal(shown, colours[[0, 0, 51, 255, 255, 0]])
 
 
 def test_the_map_is_brightest_along_the_step(row: StillRow) -> None:
