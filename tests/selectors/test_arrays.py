@@ -201,6 +201,27 @@ for seed in range(ROUNDS):
             damaged[int(rng.integers(len(damaged)))] = int(rng.integers(256))
         decode_depth(codec, bytes(damaged), height, width)
         tried += 1
+    live = NeuralGasSelector(nodes=30)
+    for _ in range(3):
+        try:
+            live.update(seeds)
+        except ValueError:
+            pass
+        tried += 1
+corner = np.random.default_rng(0).normal(size=(60, 3))
+with open(FILE, "w") as file:
+    file.write("ply\\nformat ascii 1.0\\nelement vertex 60\\nproperty float x\\n")
+    file.write("property float y\\nproperty float z\\nelement face 40\\n")
+    file.write("property list uchar int vertex_indices\\nend_header\\n")
+    for point in corner:
+        file.write(" ".join(map(str, point)) + "\\n")
+    for face in range(40):
+        sides = 3 + face % 3
+        file.write(f"{sides} " + " ".join(str((face + k) % 60) for k in range(sides)) + "\\n")
+for side in ("front", "left", "top"):
+    with open_source(FILE + f"?side={side}") as source:
+        source.read()
+    tried += 1
 for scene in ("workstation", "ball", "firehose"):
     with open_source(f"virtual:{scene}?frames=1&size=160x120") as source:
         source.read()
@@ -213,7 +234,11 @@ print(tried)
 def test_no_kernel_leaves_its_arrays(tmp_path: Path) -> None:
     """Every kernel with the bounds of its arrays checked, on random and extreme input."""
     done = subprocess.run(
-        [sys.executable, "-c", BOUNDS.replace("ROUNDS", "40")],
+        [
+            sys.executable,
+            "-c",
+            BOUNDS.replace("ROUNDS", "40").replace("FILE", repr(str(tmp_path / "some.ply"))),
+        ],
         cwd=ROOT,
         env={**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)},
         capture_output=True,
