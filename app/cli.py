@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import arg
 
@@ -23,10 +23,8 @@ from selective_depth.app.settings import (
     Natural,
     PictureOptions,
     Positive,
-    Rounds,
     SeedOptions,
     Settings,
-    Share,
     TimeLimit,
     optional,
     whole,
@@ -45,7 +43,8 @@ SourceOrSample = Annotated[str | None, optional("SOURCE")]
 Options = Annotated[Settings, arg(name="")]
 Acquiring = Annotated[AcquireOptions, arg(name="")]
 Page = Annotated[PictureOptions, arg(name="")]
-DEFAULTS, PAGE = Settings(), PictureOptions()
+DEFAULTS, PAGE, MODEL = Settings(), PictureOptions(), AcquireOptions(budget=0.05, rounds=8)
+SCENES = ("virtual:workstation", "virtual:ball", "virtual:firehose")
 
 
 @command(
@@ -199,9 +198,10 @@ def model(
     out: Annotated[Path, arg(metavar="DIR")],
     /,
     frame: Natural = 0,
-    budget: Annotated[Share, arg(metavar="SHARE")] = 0.05,
-    rounds: Rounds = 8,
     seeds: SeedOptions = DEFAULTS.seeds,
+    gas: GasOptions = DEFAULTS.gas,
+    improvement: ImprovementOptions = DEFAULTS.improvement,
+    acquire: Acquiring = MODEL,
 ) -> int:
     """Acquire one frame selectively and save the model: cloud.ply, depth.png, samples.npz.
 
@@ -213,16 +213,13 @@ def model(
         Folder for the three files.
     frame : int
         Which frame, from 0.
-    budget : float
-        Measurements beyond the seeds, as a share of the frame's pixels.
-    rounds : int
-        Rounds in which they are taken.
-    seeds
-        The seed lattice.
+    seeds, gas, improvement, acquire
+        Options of the acquisition and of the selector that drives it.
     """
     from selective_depth.app.commands.model import model_frame
 
-    return model_frame(source, out, frame, budget, rounds, (seeds.rows, seeds.columns))
+    settings = Settings(seeds=seeds, gas=gas, improvement=improvement, acquire=acquire)
+    return model_frame(source, out, frame, settings)
 
 
 @command(
@@ -361,6 +358,75 @@ def densities(
     from selective_depth.app.commands.figures import draw_densities
 
     return draw_densities(source, out, number=frame, epochs=epochs, seed=seed, page=page)
+
+
+@command(
+    "Pictures",
+    (f"{PROGRAM} figure 5", "both selectors on the three scenes, to figure-5.png"),
+    (f"{PROGRAM} figure 1 bunny.ply --out fig1.pdf", "neural gas by epochs, of your own object"),
+    (f"{PROGRAM} figure 5 frames/ --preset paper", "with the paper's own options"),
+)
+def figure(
+    number: Annotated[Literal[1, 2, 4, 5], arg(metavar="1|2|4|5")],
+    sources: Annotated[tuple[str, ...], optional("SOURCE...")] = (),
+    /,
+    out: Annotated[Path | None, optional("FILE")] = None,
+    frame: Natural = 0,
+    seeds: SeedOptions = DEFAULTS.seeds,
+    gas: GasOptions = DEFAULTS.gas,
+    improvement: ImprovementOptions = DEFAULTS.improvement,
+    page: Page = PAGE,
+) -> int:
+    """Make a figure of the paper, on the virtual scenes or on any source.
+
+    1: neural gas by training length. 2: by density of the first scan. 4: the scenes. 5: what
+    both selectors find in them.
+
+    Parameters
+    ----------
+    number : int
+        The paper's number of it.
+    sources : tuple of str
+        As for replay; by default the three virtual scenes, of which 1 and 2 take the first.
+    out : Path
+        The picture to make, .png, .webp, .pdf or .svg; by default figure-N.png.
+    frame : int
+        Which frame of each source, from 0.
+    seeds, gas, improvement
+        Options of the selectors.
+    page
+        The page.
+    """
+    from selective_depth.app.commands.paper import draw_figure
+
+    settings = Settings(seeds=seeds, gas=gas, improvement=improvement)
+    return draw_figure(number, sources or SCENES, out, frame, settings, page)
+
+
+@command(
+    "Pictures",
+    (f"{PROGRAM} table 1", "computing times on the three scenes, as in the paper"),
+)
+def table(
+    number: Annotated[Literal[1], arg(metavar="1")] = 1,
+    sources: Annotated[tuple[str, ...], optional("SOURCE...")] = (),
+    /,
+    frame: Natural = 0,
+) -> int:
+    """Time neural gas and the improvement map, with the paper's options; takes half a minute.
+
+    Parameters
+    ----------
+    number : int
+        The paper's number of it.
+    sources : tuple of str
+        As for replay; by default the three virtual scenes.
+    frame : int
+        Which frame of each source, from 0.
+    """
+    from selective_depth.app.commands.paper import print_times
+
+    return print_times(sources or SCENES, frame)
 
 
 # Declared here, to be listed after those above.

@@ -12,9 +12,12 @@ from selective_depth.app.settings import (
     ComparisonOptions,
     EvaluationFiles,
     Flag,
+    GasOptions,
+    ImprovementOptions,
     Limit,
     PictureOptions,
     SeedOptions,
+    Settings,
     optional,
 )
 
@@ -23,11 +26,11 @@ SourceOrSample = Annotated[str | None, optional("SOURCE")]
 Page = Annotated[PictureOptions, arg(name="")]
 Files = Annotated[EvaluationFiles, arg(name="")]
 Compared = Annotated[ComparisonOptions, arg(name="")]
-SEEDS, PAGE, FILES, COMPARED = (
-    SeedOptions(),
+PAGE, FILES, COMPARED, DEFAULTS = (
     PictureOptions(),
     EvaluationFiles(),
     ComparisonOptions(),
+    Settings(),
 )
 
 
@@ -108,7 +111,9 @@ def evaluate(
     sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
     comparison: Compared = COMPARED,
-    seeds: SeedOptions = SEEDS,
+    seeds: SeedOptions = DEFAULTS.seeds,
+    gas: GasOptions = DEFAULTS.gas,
+    improvement: ImprovementOptions = DEFAULTS.improvement,
     files: Files = FILES,
     page: Page = PAGE,
 ) -> None:
@@ -122,6 +127,8 @@ def evaluate(
         What is compared on what.
     seeds
         The seed lattice.
+    gas, improvement
+        Options of the two published selectors.
     files
         What is written.
     page
@@ -129,4 +136,5 @@ def evaluate(
     """
     from selective_depth.app.evaluation.report import run_evaluation
 
-    run_evaluation(sources, comparison, (seeds.rows, seeds.columns), files=files, page=page)
+    settings = Settings(seeds=seeds, gas=gas, improvement=improvement)
+    run_evaluation(sources, comparison, settings, files=files, page=page)

@@ -66,7 +66,15 @@ Natural = Annotated[int, whole(0)]
 Count = Annotated[int, whole(1)]
 Limit = Annotated[int | None, whole(1), optional("N")]
 Rounds = Annotated[int, whole(1, MOST_ROUNDS)]
-Share = Annotated[float, must_be("a share between 0 and 1", float, lambda x: 0 <= x <= 1)]
+
+
+def _share(typed: str) -> float:
+    return float(typed[:-1]) / 100 if typed.endswith("%") else float(typed)
+
+
+Share = Annotated[
+    float, must_be("a share between 0 and 1, or of 100%", _share, lambda x: 0 <= x <= 1)
+]
 positive = must_be("more than 0", float, lambda x: 0 < x < float("inf"))
 Positive = Annotated[float, positive]
 TimeLimit = Annotated[float | None, positive, optional("SECONDS")]
@@ -117,6 +125,8 @@ class ImprovementOptions:
         float, must_be("more than 0, at most 1.9999", float, lambda w: 0 < w <= 1.9999)
     ] = 1.2
     """Exponent w = 2 - epsilon of the semivariogram, eq. (24)."""
+    formula: Literal["eq23", "eq27"] = "eq23"
+    """Eq. (23), or eq. (27), which holds for exponents near 2: sums over each neighbourhood."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +205,8 @@ class ComparisonOptions:
     rounds: Rounds = 8
     """Rounds of the closed loops."""
     strategies: Annotated[tuple[str, ...], arg(metavar="NAME...")] = ("main",)
-    """What is compared: main, all, or names out of the table; uniform and oracle always are."""
+    """What is compared: main, all, names out of the table, or FILE.py:NAME, a selector of your
+    own; uniform and oracle always are."""
     random_seeds: Count = 3
     """How often strategies that draw at random are run."""
     jobs: Limit = None
@@ -212,6 +223,10 @@ class EvaluationFiles:
     """Draw where each strategy measured and how wrong its model is, for the first frame."""
     page: Annotated[Path | None, optional("FILE.md")] = None
     """Write the tables in Markdown."""
+    table: Annotated[Path | None, optional("FILE.parquet")] = None
+    """Write a row for each frame, budget, strategy and draw, as .parquet or .csv."""
+    curves: Annotated[Path | None, optional("FILE.pdf")] = None
+    """Draw the error over the share of pixels measured; more budgets make longer curves."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -20,13 +19,12 @@ from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import check_output, check_picture, write_output
 from selective_depth.app.console.progress import waiting
 from selective_depth.app.pictures import Panel, sheet, write_picture
-from selective_depth.app.pictures.palette import Image
 from selective_depth.app.pictures.panels import (
     backdrop,
     draw_kept_triangles,
     draw_nodes,
+    shaded_panel,
     tinted,
-    with_holes,
 )
 from selective_depth.app.pictures.sheets import WIDTH_IN, Row
 from selective_depth.app.pipeline import say
@@ -192,7 +190,7 @@ def _figure(
     width_in: float,
 ) -> Figure:
     """The object, then a column per training: nodes above, kept triangles by each metric below."""
-    first = Panel("object", "Object", _shaded(frame), note=note)
+    first = shaded_panel(frame, "Object", note)
     nodes = [
         Panel(
             "nodes",
@@ -213,18 +211,6 @@ def _figure(
         ]  # fmt: skip
         rows.append((f"Triangles kept: {_NAMES[metric]}", [None, *kept]))
     return sheet(rows, width_in, legend=False)
-
-
-def _shaded(frame: DepthFrame) -> Image:
-    """The object lit from the upper left."""
-    from matplotlib.colors import LightSource
-
-    known = frame.depth_mm > 0
-    mm_per_pixel = float(np.median(frame.depth_mm[known])) / frame.camera.fx if known.any() else 1
-    near_mm = -cv2.GaussianBlur(frame.depth_mm.astype(np.float32), (0, 0), 1.5)
-    light = LightSource(315, 45).hillshade(near_mm, dx=mm_per_pixel, dy=mm_per_pixel)
-    grey = (60 + 190 * light).astype(np.uint8)
-    return with_holes(np.repeat(grey[:, :, None], 3, axis=2), ~known)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,8 @@ from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import make_folder, write_output
 from selective_depth.app.pictures import palette
 from selective_depth.app.pipeline import say
+from selective_depth.app.pipeline.selecting import selector_of
+from selective_depth.app.settings import Settings
 from selective_depth.drivers.frame import Camera
 from selective_depth.selectors.acquire import Acquisition, acquire
 from selective_depth.selectors.seeds import SeedGrid
@@ -120,9 +122,7 @@ def save_model(folder: Path, acquisition: Acquisition, camera: Camera) -> list[P
     return [cloud, depth, samples]
 
 
-def model_frame(
-    source: str, out: Path, number: int, budget: float, rounds: int, seeds_shape: tuple[int, int]
-) -> int:
+def model_frame(source: str, out: Path, number: int, settings: Settings) -> int:
     """Acquire one frame of a source selectively and save the model; returns the exit code.
 
     Raises
@@ -130,10 +130,13 @@ def model_frame(
     OutputError
         If a file cannot be written.
     UsageError
-        If there is no such frame.
+        If there is no such frame, or no such selector.
     """
+    selector = selector_of(settings, None)
     frame = nth_frame(source, number)
-    seeds = SeedGrid.from_frame(frame, seeds_shape)
-    for path in save_model(out, acquire(frame.measure, seeds, budget, rounds), frame.camera):
+    seeds = SeedGrid.from_frame(frame, (settings.seeds.rows, settings.seeds.columns))
+    how = settings.acquire
+    acquisition = acquire(frame.measure, seeds, float(how.budget), how.rounds, selector)
+    for path in save_model(out, acquisition, frame.camera):
         say(f"wrote {path}")
     return OK

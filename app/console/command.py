@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.settings_file import settings_arguments
+from selective_depth.app.console.settings_file import preset_arguments, settings_arguments
 
 PROGRAM = "selective-depth"
 SHELLS = ("bash", "zsh")
@@ -114,6 +114,7 @@ def overview(examples: Sequence[Example]) -> str:
         "  -v, --verbose        say more",
         "  --debug              show the traceback of an error",
         "  --settings FILE      take options from a TOML file; the command line wins",
+        "  --preset paper       take the options that the paper's section V was made with",
         "Alone:",
         "  --version            versions of this program and of the OpenNI2 runtime found",
         f"  --completion SHELL   print a completion script for {', '.join(SHELLS)}",
@@ -164,9 +165,9 @@ def parse(chosen: Command, arguments: Sequence[str]) -> Callable[[], int | None]
 
 
 def parse_with_settings(
-    chosen: Command, arguments: Sequence[str], file: Path
+    chosen: Command, arguments: Sequence[str], file: Path | None, preset: str | None
 ) -> Callable[[], int | None]:
-    """As `parse`, with the options of a settings file where they are not typed.
+    """As `parse`, with the options of a settings file, else of a preset, where none are typed.
 
     Raises
     ------
@@ -175,8 +176,11 @@ def parse_with_settings(
     """
     parameters = inspect.signature(chosen.run).parameters
     defaults = {name: each.default for name, each in parameters.items()}
+    # Before what was typed, so that what was typed wins.
+    arguments = [*(preset_arguments(preset, defaults) if preset else ()), *arguments]
+    if file is None:
+        return parse(chosen, arguments)
     try:
-        # Before what was typed, so that what was typed wins.
         return parse(chosen, [*settings_arguments(file, defaults), *arguments])
     except UsageError as error:
         parse(chosen, arguments)  # or is it what was typed that is wrong?

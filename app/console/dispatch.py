@@ -17,7 +17,6 @@ from selective_depth.app.console.command import (
     completion,
     find,
     overview,
-    parse,
     parse_with_settings,
 )
 from selective_depth.app.console.errors import AppError, UsageError
@@ -74,16 +73,24 @@ def _dispatch(words: list[str], verbose: bool, examples: Sequence[Example]) -> i
         print(_versions())
     elif first == "--completion":
         print(completion(typed[0] if typed else ""))
-    elif "--settings" not in typed:
-        return parse(find(first), typed)() or OK
     else:
-        at = typed.index("--settings")
-        if at + 1 == len(typed):
-            raise UsageError("--settings needs a file: --settings FILE.toml")
-        file = Path(typed[at + 1])
-        del typed[at : at + 2]
-        return parse_with_settings(find(first), typed, file)() or OK
+        file = _value(typed, "--settings", "a file: --settings FILE.toml")
+        preset = _value(typed, "--preset", "a name: --preset paper")
+        settings = None if file is None else Path(file)
+        return parse_with_settings(find(first), typed, settings, preset)() or OK
     return OK
+
+
+def _value(words: list[str], name: str, need: str) -> str | None:
+    """Take an option's value out of a command line, None where the option is not in it."""
+    for at, word in enumerate(words):
+        if word.startswith(f"{name}="):
+            return words.pop(at).partition("=")[2]
+        if word == name:
+            if at + 1 == len(words):
+                raise UsageError(f"{name} needs {need}")
+            return [words.pop(at), words.pop(at)][1]
+    return None
 
 
 def _take(words: list[str], *names: str) -> bool:

@@ -13,6 +13,15 @@ import tomli_w
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.settings import FLAT_SECTIONS, Settings
 
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "paper": {
+        "seeds": {"rows": 128, "columns": 128},
+        "gas": {"nodes": 2800, "epochs": 50, "algorithm": "exact", "training": "cold"},
+        "improvement": {"exponent": 1.9999, "formula": "eq27"},
+    }
+}
+"""What `--preset` sets, by name: "paper" is section V's."""
+
 LARGEST_BYTES = 1 << 20
 """No settings file is as large as this."""
 
@@ -82,6 +91,33 @@ def settings_arguments(path: Path, defaults: dict[str, Any]) -> list[str]:
         elif value is not False:
             arguments.append(f"{option}={value}")
     return arguments
+
+
+def preset_arguments(name: str, defaults: dict[str, Any]) -> list[str]:
+    """Options of a preset, those that a command takes, as the command line would give them.
+
+    Parameters
+    ----------
+    name : str
+        One of `PRESETS`.
+    defaults : dict
+        The command's parameters with their defaults.
+
+    Raises
+    ------
+    UsageError
+        If there is no such preset, or the command has none of its options.
+    """
+    if name not in PRESETS:
+        raise UsageError(f"--preset is '{name}'; there is {' and '.join(PRESETS)}.")
+    taken = {
+        *defaults,
+        *(key for value in defaults.values() for key in getattr(value, "__dict__", ())),
+    }
+    sections = {key: value for key, value in PRESETS[name].items() if key in taken}
+    if not sections:
+        raise UsageError(f"--preset {name} sets none of this command's options; leave it out.")
+    return [f"{option}={value}" for option, value in _flattened(sections, "")]
 
 
 def _is_of(settings: Path, saved: Path) -> bool:

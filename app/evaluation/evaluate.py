@@ -22,7 +22,13 @@ import numpy as np
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.evaluation.strategies import STRATEGIES, Case
+from selective_depth.app.evaluation.strategies import (
+    STRATEGIES,
+    Case,
+    strategies_of,
+    strategy_of,
+)
+from selective_depth.app.settings import Settings
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
@@ -36,7 +42,7 @@ ENDLESS_FRAMES = 120
 
 Results = dict[str, dict[str, dict[str, float]]]
 """Budget -> strategy -> figure, as the JSON file has it."""
-_Arguments = tuple[Sequence[float], int, tuple[int, int], int, Sequence[str]]
+_Arguments = tuple[Sequence[float], int, tuple[int, int], int, Sequence[str], Settings]
 
 
 @dataclass(frozen=True)
@@ -64,17 +70,38 @@ class Errors:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one strategy made of one frame, once per random seed."""
+    """What one strategy made of one frame, once per random seed.
+
+    Parameters
+    ----------
+    frame : str
+        Its source and its number.
+    budget : float
+        Measurements beyond the seeds, as a share of the frame's pixels.
+    strategy : str
+        Name of the strategy.
+    errors : tuple of Errors
+        One of each draw.
+    source : str
+        The frame's source.
+    index : int
+        Its number there.
+    measured : float
+        Share of the frame's pixels measured by those that spend the budget, seeds included.
+    """
 
     frame: str
     budget: float
     strategy: str
     errors: tuple[Errors, ...]
+    source: str = ""
+    index: int = 0
+    measured: float = 0.0
 
 
 def run_strategy(name: str, case: Case) -> Errors:
     """Let a strategy spend its budget on one frame and see what came of it."""
-    uv = STRATEGIES[name].pixels(case)
+    uv = strategy_of(name).pixels(case)
     depth_mm = case.frame.measure(uv)
     model_mm = reconstruct(uv, depth_mm, case.frame.shape)
     errors = errors_of(model_mm, case.frame.depth_mm)
@@ -88,18 +115,22 @@ def _evaluate_frame(
     seeds_shape: tuple[int, int],
     random_seeds: int,
     strategies: Sequence[str],
+    settings: Settings,
 ) -> list[Outcome]:
     label = f"{frame.source} {frame.index}"
     outcomes = []
     for budget in budgets:
         shots = shots_of(float(budget), frame.shape)
+        measured = (shots + seeds_shape[0] * seeds_shape[1]) / frame.depth_mm.size
         for name in strategies:
-            draws = random_seeds if STRATEGIES[name].chance else 1
+            draws = random_seeds if strategy_of(name).chance else 1
             errors = tuple(
-                run_strategy(name, Case(frame, seeds_shape, shots, rounds, seed))
+                run_strategy(name, Case(frame, seeds_shape, shots, rounds, seed, settings))
                 for seed in range(draws)
             )
-            outcomes.append(Outcome(label, budget, name, errors))
+            outcomes.append(
+                Outcome(label, budget, name, errors, frame.source, frame.index, measured)
+            )
     return outcomes
 
 
@@ -155,8 +186,9 @@ def outcomes(
     rounds: int = 8,
     seeds_shape: tuple[int, int] = (128, 128),
     random_seeds: int = 3,
-    strategies: Sequence[str] = tuple(STRATEGIES),
+    strategies: Sequence[str] = ("all",),
     jobs: int | None = None,
+    settings: Settings | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Outcome]:
     """Run the strategies on frames of some sources.
@@ -178,9 +210,11 @@ def outcomes(
     random_seeds : int, default 3
         How often strategies that draw at random are run.
     strategies : sequence of str, optional
-        Names out of `STRATEGIES`; default all. "uniform" and "oracle" are always run.
+        As `strategies_of` takes them; default all. "uniform" and "oracle" are always run.
     jobs : int, optional
         Processes; default one per processor, and 1 runs in this one.
+    settings : Settings, optional
+        Options of the two published selectors.
     progress : callable, optional
         Called with the frames done and the frames in all, as far as they are known.
 
@@ -193,10 +227,11 @@ def outcomes(
     """
     if not sources:
         raise UsageError("no source was named; give recordings, folders or scenes.")
-    _check(every, frames, budgets, rounds, random_seeds, strategies, jobs)
-    names = [n for n in STRATEGIES if n in strategies or n in ("uniform", "oracle")]
+    _check(every, frames, budgets, rounds, random_seeds, jobs)
+    wanted = {*strategies_of(strategies), "uniform", "oracle"}
+    names = [n for n in STRATEGIES if n in wanted] + sorted(wanted.difference(STRATEGIES))
     jobs = jobs or default_threads()
-    arguments = (budgets, rounds, seeds_shape, random_seeds, names)
+    arguments = (budgets, rounds, seeds_shape, random_seeds, names, settings or Settings())
     total = _most(sources, every, frames)
     found: dict[int, list[Outcome]] = {}
 
@@ -270,7 +305,6 @@ def _check(
     budgets: Sequence[float],
     rounds: int,
     random_seeds: int,
-    strategies: Sequence[str],
     jobs: int | None,
 ) -> None:
     if not budgets:
@@ -289,9 +323,6 @@ def _check(
                 f"--budget is {budget}; it is a share of the frame's pixels between 0 and 1,"
                 " such as 0.05."
             )
-    for name in strategies:
-        if name not in STRATEGIES:
-            raise UsageError(f"'{name}' is no strategy; there are {', '.join(STRATEGIES)}.")
 
 
 def summarise(found: Sequence[Outcome]) -> Results:

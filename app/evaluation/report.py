@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING
@@ -21,12 +20,18 @@ from selective_depth.app.evaluation.evaluate import (
     outcomes,
     summarise,
 )
-from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of
+from selective_depth.app.evaluation.files import check_table, curves, to_json, write_table
+from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategy_of
 from selective_depth.app.pictures import Panel, sheet, write_picture
 from selective_depth.app.pictures.panels import error_panel, shots_panel
 from selective_depth.app.pictures.sheets import WIDTH_IN
 from selective_depth.app.pipeline import say
-from selective_depth.app.settings import ComparisonOptions, EvaluationFiles, PictureOptions
+from selective_depth.app.settings import (
+    ComparisonOptions,
+    EvaluationFiles,
+    PictureOptions,
+    Settings,
+)
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.reconstruct import reconstruct
@@ -48,7 +53,7 @@ TITLES = {
 def run_evaluation(
     sources: Sequence[str],
     options: ComparisonOptions,
-    seeds_shape: tuple[int, int],
+    settings: Settings,
     *,
     files: EvaluationFiles,
     page: PictureOptions,
@@ -61,9 +66,12 @@ def run_evaluation(
         If there is no such strategy or a file cannot be written; found out before the work is done
         where possible.
     """
-    check_picture(files.picture)
+    for picture in (files.picture, files.curves):
+        check_picture(picture)
     check_output(files.json, files.page)
+    check_table(files.table)
     budgets, rounds = options.budget, options.rounds
+    seeds_shape = settings.seeds.rows, settings.seeds.columns
     with FrameProgress("Evaluating", None) as bar:
         found = outcomes(
             sources,
@@ -73,16 +81,22 @@ def run_evaluation(
             rounds=rounds,
             seeds_shape=seeds_shape,
             random_seeds=options.random_seeds,
-            strategies=strategies_of(options.strategies),
+            strategies=options.strategies,
             jobs=options.jobs,
+            settings=settings,
             progress=lambda done, total: bar.update(done, f"of {total}"),
         )
     results = summarise(found)
     count = len({outcome.frame for outcome in found})
     print_results(results, count, rounds)
     if files.json is not None:
-        document = {**results, "frames": [asdict(outcome) for outcome in found]}
-        write_output(files.json, json.dumps(document, indent=1) + "\n")
+        made_with = {
+            "comparison": asdict(options),
+            **{name: asdict(getattr(settings, name)) for name in ("seeds", "gas", "improvement")},
+        }
+        write_output(files.json, to_json(found, made_with))
+    if files.table is not None:
+        write_table(files.table, found)
     if files.page is not None:
         write_output(files.page, to_markdown(found))
     if files.picture is not None:
@@ -91,7 +105,9 @@ def run_evaluation(
             frame, budgets[0], rounds=rounds, seeds_shape=seeds_shape, width_in=page.width
         )
         write_picture(files.picture, shown, page.dpi)
-    for path in (files.json, files.page, files.picture):
+    if files.curves is not None:
+        write_picture(files.curves, curves(found, page.width), page.dpi)
+    for path in (files.json, files.table, files.page, files.picture, files.curves):
         if path is not None:
             say(f"wrote {path}")
     return results
@@ -145,7 +161,7 @@ def to_markdown(found: Sequence[Outcome]) -> str:
         ]
         for name, row in table.items():
             lines.append(
-                f"| {STRATEGIES[name].about} (`{name}`) | {row['geo']:.3f} | {row['worst']:.3f} |"
+                f"| {strategy_of(name).about} (`{name}`) | {row['geo']:.3f} | {row['worst']:.3f} |"
                 f" {row['share']:.1%} | {row['share_min']:.1%} | {row['rmse_mm']:.1f} |"
                 f" {row['mae_mm']:.2f} |"
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import cv2
@@ -11,15 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.app.console.errors import UsageError
+from selective_depth.app.evaluation.quadtree import quadtree
+from selective_depth.app.pipeline.selecting import gas_of, improvement_of, selector_of
+from selective_depth.app.settings import AcquireOptions, Settings
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.selectors.acquire import StepSelector, SurfaceSelector, acquire
-from selective_depth.selectors.even import EvenSelector, even_lattice, spread
-from selective_depth.selectors.improvement import ImprovementSelection, ImprovementSelector
-from selective_depth.selectors.neural_gas import (
-    LongEdgeSelector,
-    NeuralGasSelector,
-    RegionSelection,
-)
+from selective_depth.selectors.acquire import acquire
+from selective_depth.selectors.even import even_lattice, spread
+from selective_depth.selectors.improvement import ImprovementSelection
+from selective_depth.selectors.neural_gas import RegionSelection
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
@@ -45,6 +44,8 @@ class Case:
         Rounds of the closed loops.
     seed : int
         Of the random draws.
+    settings : Settings
+        Options of the two published selectors.
     """
 
     frame: DepthFrame
@@ -52,6 +53,7 @@ class Case:
     shots: int
     rounds: int
     seed: int
+    settings: Settings = field(default_factory=Settings)
 
     @cached_property
     def seeds(self) -> SeedGrid:
@@ -81,12 +83,17 @@ class Case:
     @cached_property
     def improvement(self) -> ImprovementSelection:
         """The published improvement map of the seeds."""
-        return ImprovementSelector().select(self.seeds)
+        return improvement_of(self.settings, None).select(self.seeds)
 
     @cached_property
     def regions(self) -> RegionSelection:
         """The neural gas's regions of the seeds."""
-        return NeuralGasSelector(seed=self.seed).select(self.seeds)
+        return gas_of(self.drawing, None).select(self.seeds)
+
+    @property
+    def drawing(self) -> Settings:
+        """The settings, with the seed of this case's draws."""
+        return replace(self.settings, gas=replace(self.settings.gas, seed=self.seed))
 
     def lattice(self, pixels: float) -> Pixels:
         """A fresh lattice of square pitch with about so many pixels."""
@@ -172,26 +179,36 @@ def _slope_by_gap(samples: Samples) -> npt.NDArray[np.float32]:
     return np.asarray(np.hypot(down, along) * np.minimum(samples.gap_px(), 4), np.float32)
 
 
-SELECTORS: dict[str, tuple[str, Callable[[int], Selector | Worth], bool]] = {
-    "surface": ("surface score", lambda seed: SurfaceSelector(), False),
-    "step": ("step score", lambda seed: StepSelector(), False),
-    "gradient": ("slope of the model x gap", lambda seed: _slope_by_gap, False),
-    "improvement": ("published improvement", lambda seed: ImprovementSelector(), False),
-    "neural-gas": ("neural gas, published rule", lambda seed: NeuralGasSelector(seed=seed), True),
-    "neural-gas-edges": (
-        "neural gas, long edges",
-        lambda seed: LongEdgeSelector(NeuralGasSelector(seed=seed)),
-        True,
-    ),
-    "even": ("even fill", lambda seed: EvenSelector(), False),
+SELECTORS: dict[str, tuple[str, bool]] = {
+    "surface": ("surface score", False),
+    "step": ("step score", False),
+    "gradient": ("slope of the model x gap", False),
+    "improvement": ("published improvement", False),
+    "neural-gas": ("neural gas, published rule", True),
+    "neural-gas-edges": ("neural gas, long edges", True),
+    "even": ("even fill", False),
 }
-"""Every selector that can drive an acquisition: what it is, how it is made, whether by chance.
+"""Every selector that can drive an acquisition: what it is, and whether it draws at random.
 
 Each is compared in one shot and in the closed loop, as NAME/one-shot and NAME/loop."""
 
 
 def _selected(case: Case, name: str, *, loop: bool) -> Pixels:
-    return _loop(case, case.rounds if loop else 1, SELECTORS[name][1](case.seed))
+    rounds = case.rounds if loop else 1
+    if name == "gradient":
+        return _loop(case, rounds, _slope_by_gap)
+    settings = replace(case.drawing, acquire=AcquireOptions(rounds=rounds, by=name))
+    return _loop(case, rounds, selector_of(settings, None))
+
+
+def _driven(name: str, about: str, chance: bool) -> dict[str, Strategy]:
+    """A selector in one shot and in the loop."""
+    return {
+        f"{name}/{kind}": Strategy(
+            f"{about}, {words}", partial(_selected, name=name, loop=kind == "loop"), chance
+        )
+        for kind, words in (("one-shot", "one shot"), ("loop", "closed loop"))
+    }
 
 
 STRATEGIES: dict[str, Strategy] = {
@@ -215,9 +232,13 @@ STRATEGIES: dict[str, Strategy] = {
     ),
     "improvement_loop": Strategy(
         "published improvement, closed loop",
-        lambda c: _loop(c, c.rounds, ImprovementSelector()),
+        lambda c: _selected(c, "improvement", loop=True),
     ),
     "gradient": Strategy("gradient of the interpolated depth, one shot", _gradient),
+    "quadtree": Strategy(
+        "quad-tree, largest error split first",
+        lambda c: quadtree(c.frame.measure, c.seeds, c.shots),
+    ),
     "step": Strategy("step score, one shot", lambda c: _loop(c, 1)),
     "loop": Strategy("surface score, closed loop: the default", lambda c: _loop(c, c.rounds)),
     "oracle": Strategy("largest true error, 16 batches", _oracle),
@@ -232,20 +253,25 @@ STRATEGIES: dict[str, Strategy] = {
         reference=True,
     ),
 }
-for _name, (_about, _, _chance) in SELECTORS.items():
-    for _kind, _words in (("one-shot", "one shot"), ("loop", "closed loop")):
-        STRATEGIES[f"{_name}/{_kind}"] = Strategy(
-            f"{_about}, {_words}", partial(_selected, name=_name, loop=_kind == "loop"), _chance
-        )
+for _name, _words in SELECTORS.items():
+    STRATEGIES |= _driven(_name, *_words)
+
+
+def strategy_of(name: str) -> Strategy:
+    """The strategy of a name, also of a selector of one's own, ``FILE.py:NAME/loop``."""
+    if name in STRATEGIES:
+        return STRATEGIES[name]
+    by = name.rpartition("/")[0]
+    return _driven(by, by.rpartition(":")[2], chance=False)[name]
 
 
 def strategies_of(names: Sequence[str]) -> tuple[str, ...]:
-    """The strategies that are meant by names, by "main" (those without a "/") or by "all".
+    """The strategies meant by names, by "main" (those without a "/"), "all" or FILE.py:NAME.
 
     Raises
     ------
     UsageError
-        If there is no such strategy, naming those there are.
+        If there is no such strategy, naming those there are, or no such selector.
     """
     meant: list[str] = []
     for name in names:
@@ -253,9 +279,13 @@ def strategies_of(names: Sequence[str]) -> tuple[str, ...]:
             meant += [each for each in STRATEGIES if name == "all" or "/" not in each]
         elif name in STRATEGIES:
             meant.append(name)
+        elif ".py:" in name:
+            by = name.removesuffix("/loop").removesuffix("/one-shot")
+            selector_of(Settings(acquire=AcquireOptions(by=by)), None)  # refused now, not later
+            meant += [each for each in _driven(by, "", chance=False) if each.startswith(name)]
         else:
             raise UsageError(
-                f"--strategies has '{name}'; it takes main, all, or names out of"
+                f"--strategies has '{name}'; it takes main, all, FILE.py:NAME, or names out of"
                 f" {', '.join(STRATEGIES)}."
             )
     return tuple(dict.fromkeys(meant))

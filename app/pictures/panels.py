@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -86,6 +87,19 @@ def depth_panel(frame: DepthFrame, caption: str = "Depth") -> Panel:
     scale = palette.depth_scale(palette.depth_limits_mm(frame.depth_mm))
     image = with_holes(scale.colour(frame.depth_mm / np.float32(1000)), frame.depth_mm == 0)
     return Panel("depth", caption, image, scale, _scene_note(frame))
+
+
+def shaded_panel(frame: DepthFrame, caption: str = "Scene", note: str = "") -> Panel:
+    """The surfaces of a frame lit from the upper left."""
+    from matplotlib.colors import LightSource
+
+    known = frame.depth_mm > 0
+    mm_per_pixel = float(np.median(frame.depth_mm[known])) / frame.camera.fx if known.any() else 1
+    near_mm = -cv2.GaussianBlur(frame.depth_mm.astype(np.float32), (0, 0), 1.5)
+    light = LightSource(315, 45).hillshade(near_mm, dx=mm_per_pixel, dy=mm_per_pixel)
+    grey = (60 + 190 * light).astype(np.uint8)
+    image = with_holes(np.repeat(grey[:, :, None], 3, axis=2), ~known)
+    return Panel("shaded", caption, image, note=note)
 
 
 def draw_nodes(axes: Axes, regions: RegionSelection) -> None:

@@ -36,7 +36,12 @@ def gas_of(settings: Settings, threads: int | None) -> NeuralGasSelector:
 def improvement_of(settings: Settings, threads: int | None) -> ImprovementSelector:
     """The improvement map that the options describe."""
     options = settings.improvement
-    return ImprovementSelector(share=options.share, exponent=options.exponent, threads=threads)
+    return ImprovementSelector(
+        share=options.share,
+        exponent=options.exponent,
+        threads=threads,
+        by_sums=options.formula == "eq27",
+    )
 
 
 def selector_of(settings: Settings, threads: int | None) -> Selector | Worth:

@@ -101,7 +101,7 @@ def krige_row(  # type: ignore[no-untyped-def]
         box = Box(columns[j] - lefts[j] + 1, rows[i] - up + 1, width, height)
         krige_window(
             samples, gathered, a, b, between[geometry], distances, first_pixel[geometry], box,
-            frame_shape, window_scratch,
+            frame_shape, window_scratch, False,
         )  # fmt: skip
         for row in range(height):
             for column in range(width):

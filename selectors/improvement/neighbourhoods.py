@@ -74,6 +74,11 @@ class Axis:
         return different, which.ravel().astype(np.int64)
 
     @property
+    def longest(self) -> int:
+        """Farthest that any window reaches from its centre, pixels."""
+        return int(max(self.before.max(), self.after.max()))
+
+    @property
     def blend(self) -> tuple[npt.NDArray[np.generic], ...]:
         """The last six, as the kernels take them."""
         at = self.first, self.second, self.first_at, self.second_at
@@ -214,9 +219,7 @@ def _windows(frame_shape: tuple[int, int], rows: bytes, columns: bytes, exponent
     reach_px = REACH * pitch
     row_axis = Axis.of(height, at_rows, reach_px)
     column_axis = Axis.of(width, at_columns, reach_px)
-    widest = max(
-        int(a.max()) for axis in (row_axis, column_axis) for a in (axis.before, axis.after)
-    )
+    widest = max(row_axis.longest, column_axis.longest)
     windows = Windows(
         row_axis, column_axis, reach_px, power_table(exponent, 2 * widest + 2), exponent
     )

@@ -63,6 +63,7 @@ def improvement_scattered(
     *,
     lattice: tuple[int, int] | None = None,
     exponent: float = EXPONENT,
+    by_sums: bool = False,
     threads: int | None = None,
 ) -> ImprovementMap:
     """Map the improvement from samples at any pixels.
@@ -82,6 +83,8 @@ def improvement_scattered(
         that is less. With the seeds' own lattice, seeds alone give the seeds' map.
     exponent : float, default 1.2
         The w = 2 - epsilon of eq. (24), in (0, 2).
+    by_sums : bool, default False
+        Take eq. (27) instead of eq. (23).
     threads : int, optional
         Kernel threads; default `default_threads()`. The result does not depend on it.
 
@@ -95,7 +98,8 @@ def improvement_scattered(
     measured[pixels[:, 1], pixels[:, 0]] = mm
     over = lattice or (min(128, shape[0]), min(128, shape[1]))
     asked = None if where is None else checked_map(where, shape, "where") > 0
-    return map_scattered(measured, asked, windows_over(shape, over, exponent), threads)
+    windows = windows_over(shape, over, exponent)
+    return map_scattered(measured, asked, windows, threads, by_sums=by_sums)
 
 
 class _Work(NamedTuple):
@@ -127,6 +131,8 @@ def map_scattered(
     asked: npt.NDArray[np.bool_] | None,
     windows: Windows,
     threads: int | None,
+    *,
+    by_sums: bool = False,
 ) -> ImprovementMap:
     """Map the improvement of an image of samples (mm, 0 = none) at the pixels asked for, or all."""
     asked = np.ones(measured.shape, np.bool_) if asked is None else asked
@@ -151,7 +157,7 @@ def map_scattered(
             first_row, end_row, measured, asked,
             (rows.centres, rows.before, rows.after),
             (columns.centres, columns.before, columns.after),
-            windows.power, spiral, windows.reach_px**2, work,
+            windows.power, spiral, windows.reach_px**2, by_sums, work,
             (result.estimate_mm, result.variance_mm2, result.raw, result.known),
         )  # fmt: skip
 
@@ -213,6 +219,7 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
     power,
     spiral,
     reach_squared,
+    by_sums,
     work,
     out,
 ):  # fmt: skip
@@ -232,6 +239,8 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
         Differences (row, column), the nearest first.
     reach_squared : float
         Pixels farther from every sample are not known, squared pixels.
+    by_sums : bool
+        Take eq. (27) instead of eq. (23).
     work : _Work
         Working memory of this band.
     out : tuple of arrays of shape (H, W)
@@ -274,7 +283,9 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
                         distances[n, p] = line[reach + x - u[n]]
                         p += 1
             box = Box(start, top, width, height)
-            krige_window(samples, count, a, b, between, distances, 0, box, measured.shape, scratch)
+            krige_window(
+                samples, count, a, b, between, distances, 0, box, measured.shape, scratch, by_sums
+            )
             for y in range(y0, y1):
                 gap = up[i] if y < rows[i] else down[i]
                 share_y = count * (1.0 - abs(y - rows[i]) / gap)

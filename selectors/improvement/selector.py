@@ -13,7 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import maximum_filter
 
+from selective_depth.selectors.choice import choose
 from selective_depth.selectors.improvement.lattice import lattice_scratch
 from selective_depth.selectors.improvement.map import (
     LEVEL_SHIFT,
@@ -22,7 +24,12 @@ from selective_depth.selectors.improvement.map import (
     improvement_rows,
 )
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_of
-from selective_depth.selectors.improvement.scattered import EXPONENT, MOST_EXPONENT, map_scattered
+from selective_depth.selectors.improvement.scattered import (
+    EXPONENT,
+    MOST_EXPONENT,
+    ImprovementMap,
+    map_scattered,
+)
 from selective_depth.selectors.improvement.systems import (
     aligned_zeros,
     sample_buffers,
@@ -79,6 +86,9 @@ class ImprovementSelector:
         The w = 2 - epsilon of eq. (24), in (0, 2).
     threads : int, optional
         Kernel threads; default `default_threads()`. The result does not depend on it.
+    by_sums : bool, default False
+        Take eq. (27), from sums over each neighbourhood, instead of eq. (23): the paper's way for
+        an exponent near 2.
 
     Raises
     ------
@@ -89,7 +99,12 @@ class ImprovementSelector:
     name = "improvement"
 
     def __init__(
-        self, share: float = 0.10, exponent: float = EXPONENT, threads: int | None = None
+        self,
+        share: float = 0.10,
+        exponent: float = EXPONENT,
+        threads: int | None = None,
+        *,
+        by_sums: bool = False,
     ) -> None:
         if not 0 <= share <= 1:
             raise ValueError(f"share is {share}; it is a part of all pixels, 0..1")
@@ -101,6 +116,7 @@ class ImprovementSelector:
         self.share = share
         self.exponent = exponent
         self.threads = threads
+        self.by_sums = by_sums
 
     def select(self, samples: SeedGrid | Samples) -> ImprovementSelection:
         """Map the improvement over the whole frame and select its best pixels.
@@ -111,8 +127,8 @@ class ImprovementSelector:
             The seeds alone, which take the quick way, or all samples so far
             (`improvement_scattered`, with windows about the seeds).
         """
-        if isinstance(samples, Samples):
-            return self._select_scattered(samples)
+        if isinstance(samples, Samples) or self.by_sums:
+            return self._select_scattered(Samples.of(samples))
         seeds = samples
         windows = windows_of(seeds, self.exponent)
         shape = seeds.frame_shape
@@ -147,9 +163,17 @@ class ImprovementSelector:
             raw=raw,
         )
 
-    def _select_scattered(self, samples: Samples) -> ImprovementSelection:
+    def plan(self, samples: Samples) -> ImprovementPlan:
+        """Begin an acquisition: after each round the map is made again where that changed it."""
+        return ImprovementPlan(self, samples)
+
+    def _map(self, samples: Samples, asked: BoolMap | None = None) -> ImprovementMap:
         windows = windows_of(samples.seeds, self.exponent)
-        found = map_scattered(np.maximum(samples.image_mm, 0), None, windows, self.threads)
+        measured_mm = np.maximum(samples.image_mm, 0)
+        return map_scattered(measured_mm, asked, windows, self.threads, by_sums=self.by_sums)
+
+    def _select_scattered(self, samples: Samples) -> ImprovementSelection:
+        found = self._map(samples)
         raw = found.raw
         wanted = int(self.share * np.count_nonzero(found.known))
         half = np.float32(HALF_SCORE * samples.depth_mm.mean() if len(samples.uv) else 1.0)
@@ -163,6 +187,35 @@ class ImprovementSelector:
             known=found.known,
             raw=raw,
         )
+
+
+class ImprovementPlan:
+    """An acquisition under way, with the improvement map as it is at this stage.
+
+    A measurement changes the windows that hold it, and so the map in their boxes alone.
+    """
+
+    def __init__(self, rule: ImprovementSelector, samples: Samples) -> None:
+        self._rule = rule
+        self._samples = samples
+        self._seen = 0
+        self._raw = np.zeros(samples.frame_shape, np.float32)
+
+    def best(self, shots: int) -> npt.NDArray[np.int32]:
+        """The `shots` pixels whose measurement improves most, near some return."""
+        samples, rule = self._samples, self._rule
+        changed = np.zeros(samples.frame_shape, np.bool_)
+        added = [uv for uv, depth_mm in samples.added_since(self._seen)]
+        if added:
+            windows = windows_of(samples.seeds, rule.exponent)
+            new = np.concatenate(added)
+            changed[new[:, 1], new[:, 0]] = True
+            # From one end of a window, rim included, to the pixel before the other.
+            sides = [4 * axis.longest - 1 for axis in (windows.rows, windows.columns)]
+            changed = maximum_filter(changed, sides)
+            self._raw[changed] = rule._map(samples, changed).raw[changed]
+            self._seen = samples.additions
+        return choose(np.where(samples.open(), self._raw, 0), shots, threads=rule.threads)
 
 
 class _Kept(threading.local):

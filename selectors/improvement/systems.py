@@ -23,8 +23,16 @@ that eq. (11) never divides by nothing.
 Erratum: eq. (27), the paper's expansion of eq. (23) for w = 2, ends in
 ``+ 2b / var(s) - b^2 / (var(s) z(s))``. The first term is a misprint for ``2b / z(s)``: it
 undoes ``gamma(s, s) = b`` in the sums before it, whose term j = s is (var(s) - b)^2 / z(s)
-over var(s) instead of var(s)^2. The tests compare both with eq. (13). Nothing here uses
-eq. (27): summing over five pixels costs less than its moments.
+over var(s) instead of var(s)^2. The tests compare both with eq. (13).
+
+With w = 2 the covariances of a pixel are linear in where j is, so that eq. (27) needs but sums
+over the p_j. Counted from s, with ``d = s - sum_i lambda_i p_i``, the distance from s to where the
+samples' places are estimated by the same weights,
+
+    cov(s,j) = var(s) - b + 2 a d . (j - s)      for j != s,
+
+exact as w -> 2 where b > 0 (`_improve_by_sums`). Without a nugget the variance vanishes as fast
+as that formula's error, and eq. (23) is taken.
 """
 
 from __future__ import annotations
@@ -46,6 +54,11 @@ BLOCK = 4
 
 MAX_PIXELS = 16384
 """Most pixels in one window, rim included."""
+
+MOMENTS_NUGGET = 3.0
+"""Least b / a, in square pixels, for which eq. (27) is taken.
+
+At w = 1.999 it is then within .1 % of eq. (13), whose terms of h^w - h^2 it leaves out."""
 
 # The rows of U stand this far apart in one array: constant, so that the compiler can see that
 # the rows a loop writes are not those it reads; and one cache line off a power of two.
@@ -92,6 +105,8 @@ def window_scratch(pixels: int) -> tuple[npt.NDArray[Any], ...]:
         aligned_empty(MAX_SAMPLES * _STRIDE),  # U
         np.zeros((MAX_SAMPLES, MAX_SAMPLES), np.float64),  # L, its diagonal inverted
         np.zeros(MAX_SAMPLES, np.float64),  # L^-1 (Z - z_ref)
+        aligned_zeros(2, pixels),  # columns and rows by the same weights, from the reference on
+        np.zeros((2, MAX_SAMPLES), np.float64),  # L^-1 of the samples' columns and rows
     )
 
 
@@ -176,7 +191,7 @@ def _solve_block(block, corner, pixels):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def krige_window(  # type: ignore[no-untyped-def]
-    samples, count, a, b, between, distances, first, box, frame_shape, scratch
+    samples, count, a, b, between, distances, first, box, frame_shape, scratch, by_sums
 ):
     """Krige one window; results in the first three arrays of `scratch`.
 
@@ -198,9 +213,12 @@ def krige_window(  # type: ignore[no-untyped-def]
         Pixels outside the frame are no neighbours.
     scratch : tuple
         `window_scratch`.
+    by_sums : bool
+        Take eq. (27), where the nugget allows it, instead of eq. (23).
     """
-    z, row_of = samples[2], samples[3]
-    estimate, variance, _, _, right, below, U, L, y = scratch
+    u, v, z, row_of = samples
+    estimate, variance, improvement, _, right, below, U, L, y, places, along = scratch
+    by_sums = by_sums and b >= MOMENTS_NUGGET * a > 0
     stride = box.width + 2
     pixels = (stride * (box.height + 2) + VECTOR - 1) // VECTOR * VECTOR
     scale, nugget = np.float32(a), np.float32(b)
@@ -210,6 +228,11 @@ def krige_window(  # type: ignore[no-untyped-def]
     blocks = (m + BLOCK - 1) // BLOCK
     L[m : blocks * BLOCK] = 0
     y[m : blocks * BLOCK] = 0
+    if by_sums:
+        places[:] = 0
+        along[:] = 0
+        _whiten(u, m, L, along[0])
+        _whiten(v, m, L, along[1])
     ref = distances[row_of[0], first : first + pixels + stride]
     for p in range(pixels):
         toward = scale * ref[p] + nugget
@@ -257,6 +280,10 @@ def krige_window(  # type: ignore[no-untyped-def]
             r2, r3 = block[2 * _STRIDE + p], block[3 * _STRIDE + p]
             estimate[p] += f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3
             variance[p] -= r0 * r0 + r1 * r1 + r2 * r2 + r3 * r3
+        if by_sums:
+            for axis in range(2):
+                _add_rows(block, along[axis, k : k + BLOCK], places[axis], pixels)
+            continue
         for p in range(pixels):
             c = block[p] * block[p + 1] + block[_STRIDE + p] * block[_STRIDE + p + 1]
             c += block[2 * _STRIDE + p] * block[2 * _STRIDE + p + 1]
@@ -267,22 +294,59 @@ def krige_window(  # type: ignore[no-untyped-def]
             c += block[2 * _STRIDE + p] * under[2 * _STRIDE + p]
             below[p] -= c + block[3 * _STRIDE + p] * under[3 * _STRIDE + p]
 
-    _improve(samples, count, box, frame_shape, scratch)
+    _settle(samples, count, box, frame_shape, scratch)
+    if by_sums:
+        _improve_by_sums(samples, scale, nugget, box, scratch)
+    else:
+        _improve(box, scratch)
+    for i in range(count):
+        row, column = v[i] - box.v0 + 1, u[i] - box.u0 + 1
+        if 0 <= row < box.height + 2 and 0 <= column < stride:
+            p = row * stride + column
+            estimate[p] = z[i]
+            variance[p] = np.float32(0.0)
+            improvement[p] = np.float32(0.0)
+
+
+@njit(cache=True, forceinline=True, nogil=True, error_model="numpy")
+def _whiten(values, count, L, out):  # type: ignore[no-untyped-def]
+    """L^-1 of the differences of `count` values to the first one before them."""
+    for i in range(count):
+        residual = np.float64(values[i + 1] - values[0])
+        for k in range(i):
+            residual -= L[i, k] * out[k]
+        out[i] = residual * L[i, i]
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _improve(samples, count, box, frame_shape, scratch):  # type: ignore[no-untyped-def]
-    """Eq. (23) from estimates, variances and the covariances of neighbours."""
+def _add_rows(block, factors, total, pixels):  # type: ignore[no-untyped-def]
+    """Add the rows of a block of U, each by its factor."""
+    f0, f1 = np.float32(factors[0]), np.float32(factors[1])
+    f2, f3 = np.float32(factors[2]), np.float32(factors[3])
+    for p in range(pixels):
+        total[p] += (
+            f0 * block[p]
+            + f1 * block[_STRIDE + p]
+            + f2 * block[2 * _STRIDE + p]
+            + f3 * block[3 * _STRIDE + p]
+        )
+
+
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _settle(samples, count, box, frame_shape, scratch):  # type: ignore[no-untyped-def]
+    """Raise estimates and variances to what they may be at least, and invert the former.
+
+    Pixels outside the frame and samples count nothing: their inverse is 0.
+    """
     u, v, z, _ = samples
     u0, v0, width, height = box
-    estimate, variance, improvement, inverse, right, below = scratch[:6]
+    estimate, variance, inverse = scratch[0], scratch[1], scratch[3]
     stride = width + 2
     pixels = (stride * (height + 2) + VECTOR - 1) // VECTOR * VECTOR
     least = z[0]
     for i in range(1, count):
         least = min(least, z[i])
     floor = np.float32(0.5) * least
-    tiny = np.float32(1e-30)
     for p in range(pixels):
         raised = max(estimate[p], floor)
         estimate[p] = raised
@@ -300,9 +364,16 @@ def _improve(samples, count, box, frame_shape, scratch):  # type: ignore[no-unty
         if 0 <= row < height + 2 and 0 <= column < stride:
             inverse[row * stride + column] = np.float32(0.0)
 
+
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _improve(box, scratch):  # type: ignore[no-untyped-def]
+    """Eq. (23) from inverted estimates, variances and the covariances of neighbours."""
+    variance, improvement, inverse, right, below = scratch[1:6]
+    stride = box.width + 2
+    tiny = np.float32(1e-30)
     # Views that start where the loops do, and two loops of few arrays: the compiler has to
     # prove that none overlaps another.
-    size = (stride * height + VECTOR - 1) // VECTOR * VECTOR
+    size = (stride * box.height + VECTOR - 1) // VECTOR * VECTOR
     here, kept = inverse[stride:], variance[stride:]
     result = improvement[stride:]
     left_of, right_of = inverse[stride - 1 :], inverse[stride + 1 :]
@@ -315,10 +386,30 @@ def _improve(samples, count, box, frame_shape, scratch):  # type: ignore[no-unty
     for p in range(size):
         around = to_above[p] * to_above[p] * above[p] + to_below[p] * to_below[p] * under[p]
         result[p] += around / max(kept[p], tiny)
-    for i in range(count):
-        row, column = v[i] - v0 + 1, u[i] - u0 + 1
-        if 0 <= row < height + 2 and 0 <= column < stride:
-            p = row * stride + column
-            estimate[p] = z[i]
-            variance[p] = np.float32(0.0)
-            improvement[p] = np.float32(0.0)
+
+
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _improve_by_sums(samples, a, b, box, scratch):  # type: ignore[no-untyped-def]
+    """Eq. (27), its misprint mended, from sums of 1 / z over the neighbourhood of each pixel."""
+    variance, improvement, inverse = scratch[1], scratch[2], scratch[3]
+    columns, rows = scratch[9][0], scratch[9][1]
+    stride = box.width + 2
+    u_ref, v_ref = samples[0][0], samples[1][0]
+    for row in range(1, box.height + 1):
+        down = np.float32(box.v0 - 1 + row - v_ref)
+        first = row * stride
+        for column in range(1, box.width + 1):
+            p = first + column
+            d_u = np.float32(box.u0 - 1 + column - u_ref) - columns[p]
+            d_v = down - rows[p]
+            left, right = inverse[p - 1], inverse[p + 1]
+            above, under = inverse[p - stride], inverse[p + stride]
+            beyond = variance[p] - b
+            total = left + right + above + under + inverse[p]  # sum of 1 / z(j)
+            first_moments = d_u * (right - left) + d_v * (under - above)
+            second_moments = d_u * d_u * (right + left) + d_v * d_v * (under + above)
+            bracket = beyond * beyond * total + np.float32(4) * a * (
+                beyond * first_moments + a * second_moments
+            )
+            own = (np.float32(2) * b * variance[p] - b * b) * inverse[p]
+            improvement[p] = (bracket + own) / max(variance[p], np.float32(1e-30))

@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow.csv as pa_csv
 import pytest
 
 from selective_depth.app.cli import run
@@ -18,6 +19,7 @@ from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, MISUSED, OK
 from selective_depth.app.evaluation import evaluate as protocol
 from selective_depth.app.evaluation.evaluate import Errors, Outcome, outcomes, summarise
+from selective_depth.app.evaluation.quadtree import quadtree
 from selective_depth.app.evaluation.report import comparison, print_results, to_markdown
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of
 from selective_depth.app.pictures import palette
@@ -283,7 +285,7 @@ def test_selecting_pays_on_a_made_scene() -> None:
         ({"frames": 0}, "--frames is 0"),
         ({"jobs": 0}, "--jobs is 0; it must be at least 1"),
         ({"budgets": (1.5,)}, r"--budget is 1.5; it is a share .* such as 0\.05"),
-        ({"strategies": ("gradiant",)}, "'gradiant' is no strategy; there are uniform, random"),
+        ({"strategies": ("gradiant",)}, "has 'gradiant'; it takes main, all, FILE.py:NAME, or"),
     ],
 )
 def test_misuse_is_refused_in_a_sentence(option: dict[str, object], words: str) -> None:
@@ -303,20 +305,14 @@ def test_the_command_writes_table_file_and_picture(
     out, picture = tmp_path / "out.json", tmp_path / "out.png"
     words = ["evaluate", str(folder), "--budget", "0.05", "--rounds", "2", "--jobs", "1"]
     words += ["--seeds.rows", "32", "--seeds.columns", "32", "--random-seeds", "1"]
-    assert (
-        run(
-            [
-                *words,
-                "--json",
-                str(out),
-                "--picture",
-                str(picture),
-                "--page",
-                str(tmp_path / "page.md"),
-            ]
-        )
-        == OK
-    )
+    own = tmp_path / "own.py"
+    own.write_text("def far_first(samples):\n    return samples.gap_px()\n")
+    words += ["--strategies", "main", f"{own}:far_first", "--gas.nodes", "60"]
+    files = {"json": out, "picture": picture, "page": tmp_path / "page.md"}
+    files |= {"table": tmp_path / "table.csv", "curves": tmp_path / "curves.svg"}
+    for option, path in files.items():
+        words += [f"--{option}", str(path)]
+    assert run(words) == OK
     printed = capsys.readouterr().out
     document = json.loads(out.read_text())
     for name in strategies_of(["main"]):
@@ -325,12 +321,41 @@ def test_the_command_writes_table_file_and_picture(
         assert {"geo", "worst", "share", "share_min", "rmse_mm", "mae_mm"} <= set(row)
     assert document["0.05"]["uniform"]["geo"] == pytest.approx(1)
     assert document["0.05"]["oracle"]["share"] == pytest.approx(1)
+    mine = f"{own}:far_first/loop"
+    assert document["0.05"][mine]["ratio_geometric_mean"] == document["0.05"][mine]["geo"]
+    assert document["schema"] == 1 and document["settings"]["gas"]["nodes"] == 60
+    assert [each["0.05"] for each in document["sources"].values()] == [document["0.05"]]
+    rows = pa_csv.read_csv(tmp_path / "table.csv").to_pylist()
+    assert len(rows) == len(document["frames"])
+    assert {row["index"] for row in rows} == {0}
+    loop = next(row for row in rows if row["strategy"] == "loop")
+    assert loop["rmse_mm"] == pytest.approx(document["0.05"]["loop"]["rmse_mm"])
+    assert "<svg" in (tmp_path / "curves.svg").read_text()
     assert "(`loop`) |" in (tmp_path / "page.md").read_text()
     image = cv2.imread(str(picture))
     assert image is not None and image.shape[1] == 1600
     assert run(["evaluate", str(folder), "--budget", "2"]) == MISUSED
     assert run(["evaluate", str(folder), "--picture", "out.gif"]) == MISUSED
     assert run(["evaluate", str(folder), "--json", str(tmp_path / "no" / "out.json")]) == FAILED
+    assert run(["evaluate", str(folder), "--table", "out.xls"]) == MISUSED
+
+
+def test_a_quad_tree_splits_where_the_corners_foretold_worst() -> None:
+    depth = np.full((96, 128), 2000, np.uint16)
+    depth[:, 70:] = 1000  # an upright step
+    depth[:, 110:] = 0
+    seeds = SeedGrid.from_array(depth, (12, 16))
+    asked: list[tuple[int, int]] = []
+
+    def measure(uv: np.ndarray) -> np.ndarray:
+        asked.extend(map(tuple, uv.tolist()))
+        return depth[uv[:, 1], uv[:, 0]]
+
+    uv = quadtree(measure, seeds, 200)
+    assert [tuple(pixel) for pixel in uv[len(seeds.lattice_uv.reshape(-1, 2)) :].tolist()] == asked
+    assert len(asked) == len(set(asked)) == 200
+    near = sum(60 <= u <= 80 for u, _ in asked)
+    assert near > 150
 
 
 def test_the_picture_shows_shots_and_errors(tmp_path: Path) -> None:
@@ -423,5 +448,5 @@ def test_strategies_are_named_by_groups_or_one_by_one() -> None:
     assert set(every) == set(STRATEGIES)
     assert strategies_of(["improvement/loop", "main"])[0] == "improvement/loop"
     assert {"neural-gas/one-shot", "neural-gas/loop", "gradient/loop"} <= set(every)
-    with pytest.raises(UsageError, match="'nope'; it takes main, all, or names"):
+    with pytest.raises(UsageError, match="'nope'; it takes main, all, FILE.py:NAME, or names"):
         strategies_of(["nope"])

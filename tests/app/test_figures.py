@@ -104,6 +104,23 @@ def test_one_command_makes_each_figure(small, tmp_path: Path):
         assert picture is not None and picture.std() > 10
 
 
+@pytest.mark.parametrize("number", ["1", "2", "4", "5"])
+def test_each_figure_of_the_paper_has_a_command(number: str, small, tmp_path: Path):
+    out = tmp_path / "figure.png"
+    words = ["figure", number, "virtual:ball?size=160x120&noise=off", "--out", str(out)]
+    words += ["--seeds.rows", "24", "--seeds.columns", "32", "--gas.nodes", "80"]
+    assert cli.run([*words, "--gas.epochs", "2", "--dpi", "40"]) == 0
+    picture = cv2.imread(str(out))
+    assert picture is not None and picture.std() > 10
+
+
+def test_the_table_of_the_paper_shows_our_times_beside_the_papers(capsys):
+    assert cli.run(["table", "1", "virtual:ball?size=320x240&noise=off"]) == 0
+    row = next(line for line in capsys.readouterr().out.splitlines() if "ball" in line).split()
+    assert row[-2:] == ["154", "1.41"]
+    assert all(float(seconds) > 0 for seconds in row[1:4])
+
+
 def test_epochs_go_on_a_timeline_of_their_own(small, tmp_path: Path):
     rrd = tmp_path / "out.rrd"
     words = ["epochs", OBJECT, "--out", str(tmp_path / "out.png"), "--save", str(rrd)]

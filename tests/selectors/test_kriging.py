@@ -11,6 +11,7 @@ from reference_kriging import direct_improvement, gamma, krige
 from selective_depth.selectors.improvement.lattice_tables import build_tables
 from selective_depth.selectors.improvement.systems import (
     MAX_SAMPLES,
+    MOMENTS_NUGGET,
     Box,
     krige_window,
     padded_pixels,
@@ -22,7 +23,7 @@ from selective_depth.selectors.improvement.variogram import fit_moments, fit_sam
 FRAME = (480, 640)
 
 
-def window(uv, depth, a, b, w, u0, v0, width, height):
+def window(uv, depth, a, b, w, u0, v0, width, height, by_sums=False):
     """Estimate, variance and improvement of a window's pixels, each of shape (height, width)."""
     samples = sample_buffers()
     count = len(uv)
@@ -39,7 +40,7 @@ def window(uv, depth, a, b, w, u0, v0, width, height):
         distances[n, : line.size] = line
     scratch = window_scratch(room)
     box = Box(u0, v0, width, height)
-    krige_window(samples, count, a, b, between, distances, 0, box, FRAME, scratch)
+    krige_window(samples, count, a, b, between, distances, 0, box, FRAME, scratch, by_sums)
     size = (height + 2) * (width + 2)
     return [
         scratch[q][:size].reshape(height + 2, width + 2)[1:-1, 1:-1].astype(float) for q in range(3)
@@ -86,6 +87,23 @@ def test_window_equals_the_published_systems(system):
         around = s + np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])
         expected = direct_improvement(uv, depth.astype(float), s, around, a, b, w, floor)
         assert improvement.ravel()[n] == pytest.approx(expected, rel=2e-3, abs=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(systems())
+def test_a_window_by_sums_equals_eq_13_near_w_2(system):
+    """Where the nugget is large enough; elsewhere eq. (23) is taken, which equals it anyway."""
+    uv, depth, a, b, _ = system
+    _, _, improvement = window(uv, depth, a, b, 1.999, 101, 201, 9, 7, by_sums=True)
+    v, u = np.mgrid[201:208, 101:110]
+    pixels = np.stack((u.ravel(), v.ravel()), axis=1)
+    for n in range(0, len(pixels), 5):
+        around = pixels[n] + np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])
+        expected = direct_improvement(
+            uv, depth.astype(float), pixels[n], around, a, b, 1.999, depth.min() / 2
+        )
+        if b >= MOMENTS_NUGGET * a:
+            assert improvement.ravel()[n] == pytest.approx(expected, rel=5e-3, abs=1e-9)
 
 
 def test_samples_are_met_exactly_and_improve_nothing():

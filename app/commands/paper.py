@@ -1,0 +1,97 @@
+"""The figures of the paper and its table, each under its own number."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from selective_depth.app.commands.figures import draw_densities, draw_epochs
+from selective_depth.app.commands.snapshot import nth_frame, short_name, snapshot
+from selective_depth.app.console.command import colours
+from selective_depth.app.console.exit_codes import OK
+from selective_depth.app.console.output import check_picture
+from selective_depth.app.console.progress import waiting
+from selective_depth.app.pictures import sheet, write_picture
+from selective_depth.app.pictures.panels import depth_panel, shaded_panel
+from selective_depth.app.pipeline import say
+from selective_depth.app.settings import PictureOptions, Settings
+from selective_depth.selectors.improvement import ImprovementSelector
+from selective_depth.selectors.neural_gas import NeuralGasSelector
+from selective_depth.selectors.seeds import SeedGrid
+
+PAPERS_SECONDS = {"workstation": (153.0, 1.39), "ball": (153.9, 1.41), "firehose": (150.0, 1.41)}
+"""Table 1: neural gas (Matlab) and improvement map (C++, i7-2630) on its scenes of these names."""
+
+
+def draw_figure(
+    number: int,
+    sources: Sequence[str],
+    out: Path | None,
+    frame: int,
+    settings: Settings,
+    page: PictureOptions,
+) -> int:
+    """Make a figure of the paper of some sources; returns the exit code.
+
+    Raises
+    ------
+    OutputError
+        If the picture cannot be written.
+    UsageError
+        If it is of a format that cannot be made, or a source has no such frame.
+    """
+    path = out or Path(f"figure-{number}.png")
+    check_picture(path)
+    gas = settings.gas
+    if number == 1:
+        return draw_epochs(sources[0], path, save=None, number=frame, seed=gas.seed, page=page)
+    if number == 2:
+        return draw_densities(
+            sources[0], path, number=frame, epochs=gas.epochs, seed=gas.seed, page=page
+        )
+    if number == 4:
+        frames = [nth_frame(uri, frame) for uri in sources]
+        rows = [
+            (short_name(uri), (shaded_panel(shown), depth_panel(shown)))
+            for uri, shown in zip(sources, frames, strict=True)
+        ]
+        write_picture(path, sheet(rows, page.width, legend=False), page.dpi)
+    else:
+        with waiting("Running both selectors"):
+            snapshot(sources, frame, path, settings, page)
+    say(f"wrote {path}")
+    return OK
+
+
+def print_times(sources: Sequence[str], frame: int) -> int:
+    """Print what both methods take on each source, the paper's times beside them."""
+    console = Console(highlight=False, no_color=not colours())
+    shown = Table(title="Table 1: seconds per frame, 128x128 seeds, 2,800 nodes, 50 epochs",
+                  title_justify="left", box=None, padding=(0, 0, 0, 2))  # fmt: skip
+    shown.add_column("")
+    for head in ("NG exact", "NG fast", "ImpMap", "paper: NG", "ImpMap"):
+        shown.add_column(head, justify="right")
+    methods = (
+        NeuralGasSelector(algorithm="exact"),
+        NeuralGasSelector(),
+        ImprovementSelector(exponent=1.9999, by_sums=True),
+    )
+    warm = SeedGrid.from_frame(nth_frame(sources[0], frame))
+    for method in (NeuralGasSelector(10, 1, "exact"), *methods[1:]):
+        method.select(warm)  # compiled before anything is timed
+    for uri in sources:
+        seeds = SeedGrid.from_frame(nth_frame(uri, frame))
+        seconds = []
+        for method in methods:
+            start = time.perf_counter()
+            method.select(seeds)
+            seconds.append(time.perf_counter() - start)
+        name = short_name(uri)
+        papers = PAPERS_SECONDS.get(name, ())
+        shown.add_row(name, *(f"{s:.3g}" for s in (*seconds, *papers)))
+    console.print(shown)
+    return OK

@@ -1,0 +1,156 @@
+"""An evaluation as files: JSON, a table with a row per frame and strategy, curves."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from selective_depth.app import __version__
+from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.output import check_output, write_output
+from selective_depth.app.evaluation.evaluate import Outcome, summarise
+from selective_depth.app.evaluation.strategies import strategy_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCHEMA = 1
+"""Version of the JSON document and of the table."""
+FULL_WORDS = {
+    "geo": "ratio_geometric_mean",
+    "worst": "ratio_worst",
+    "share": "oracle_share_mean",
+    "share_min": "oracle_share_least",
+    "wrong": "wrong_share",
+    "missed": "missed_share",
+}
+TABLES = (".parquet", ".csv")
+
+
+def _in_full(found: Sequence[Outcome]) -> dict[str, dict[str, dict[str, float]]]:
+    """`summarise`, with every figure under its full name as well as its short one."""
+    return {
+        budget: {
+            name: figures | {FULL_WORDS[key]: figures[key] for key in FULL_WORDS}
+            for name, figures in table.items()
+        }
+        for budget, table in summarise(found).items()
+    }
+
+
+def to_json(found: Sequence[Outcome], settings: dict[str, Any]) -> str:
+    """The whole evaluation: figures by budget and strategy, in all and per source, and its making.
+
+    Parameters
+    ----------
+    found : sequence of Outcome
+        What every strategy made of every frame.
+    settings : dict
+        The options that it was made with.
+    """
+    sources = {
+        source: _in_full([each for each in found if each.source == source])
+        for source in dict.fromkeys(each.source for each in found)
+    }
+    document = {
+        **_in_full(found),
+        "schema": SCHEMA,
+        "version": __version__,
+        "settings": settings,
+        "sources": sources,
+        "frames": [asdict(outcome) for outcome in found],
+    }
+    return json.dumps(document, indent=1) + "\n"
+
+
+def check_table(path: Path | None) -> None:
+    """Refuse a table that cannot be made, before the work is done.
+
+    Raises
+    ------
+    UsageError
+        If its ending names no known format.
+    OutputError
+        If its folder does not exist.
+    """
+    if path is not None and path.suffix.lower() not in TABLES:
+        raise UsageError(f"'{path}' is a table to make; its name must end in .parquet or .csv.")
+    check_output(path)
+
+
+def write_table(path: Path, found: Sequence[Outcome]) -> None:
+    """Write a row for each frame, budget, strategy and draw, by the file's ending.
+
+    Columns: ``source``, ``index`` (of the frame), ``budget`` (share of the pixels beyond the
+    seeds), ``measured`` (share of the pixels in all), ``strategy``, ``draw`` (random seed),
+    ``rmse_mm``, ``mae_mm``, ``wrong`` and ``missed`` (shares), ``shots``.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written; an older file stays as it was.
+    """
+    rows = [
+        {
+            "source": outcome.source,
+            "index": outcome.index,
+            "budget": outcome.budget,
+            "measured": outcome.measured,
+            "strategy": outcome.strategy,
+            "draw": draw,
+            **asdict(errors),
+        }
+        for outcome in found
+        for draw, errors in enumerate(outcome.errors)
+    ]
+    table = pa.Table.from_pylist(rows)
+    table = table.replace_schema_metadata({"schema": str(SCHEMA), "version": __version__})
+    data = io.BytesIO()
+    write = pa.csv.write_csv if path.suffix.lower() == ".csv" else pa.parquet.write_table
+    write(table, data)
+    write_output(path, data.getvalue())
+
+
+def curves(found: Sequence[Outcome], width_in: float) -> Figure:
+    """Error over the share of the pixels measured, a line for each strategy.
+
+    Strategies that spend other numbers of measurements than the budget (`Strategy.reference`) are
+    left out.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    results = summarise(found)
+    measured = {f"{o.budget:g}": 100 * o.measured for o in found}
+    with rc_context({"text.parse_math": False, "font.size": 11 * width_in / 16 + 2}):
+        figure = Figure(
+            figsize=(width_in, width_in * 0.56), facecolor="white", layout="constrained"
+        )
+        axes = figure.add_subplot()
+        names = list(next(iter(results.values())))
+        for at, name in enumerate(n for n in names if not strategy_of(n).reference):
+            points = [
+                (measured[f"{float(budget):g}"], table[name]["rmse_mm"])
+                for budget, table in results.items()
+            ]
+            style = ("-", "--", ":", "-.")[at // 10 % 4]
+            bold = 3.0 if name == "loop" else 1.4
+            axes.plot(*zip(*sorted(points), strict=True), style, marker="o", linewidth=bold,
+                      markersize=4, label=name, color=f"C{at % 10}")  # fmt: skip
+        axes.set(xlabel="pixels measured, %", ylabel="RMSE of the model, mm", xscale="log",
+                 yscale="log")  # fmt: skip
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter("{x:g}")
+        axes.grid(True, which="both", alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+        figure.legend(loc="outside right upper", frameon=False)
+    return figure
