@@ -148,6 +148,8 @@ class DepthFrame:
         Intrinsics, of the image's size.
     source : str
         Where the frame came from, for messages and reports.
+    truth_mm : uint16 array of shape (height, width) or None
+        The exact depth, where a simulated sensor knows it; nobody who selects may look at it.
 
     Raises
     ------
@@ -160,6 +162,7 @@ class DepthFrame:
     timestamp_us: int
     camera: Camera
     source: str = ""
+    truth_mm: DepthArray | None = None
 
     def __post_init__(self) -> None:
         depth = self.depth_mm

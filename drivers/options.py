@@ -60,6 +60,15 @@ class Options:
             raise self._refuse(name, value, f"one of {words}")
         return value
 
+    def choices(self, name: str, allowed: Sequence[str]) -> tuple[str, ...]:
+        """Any of the words `allowed`, with + between; none by default."""
+        words = f"any of {', '.join(allowed)}, with + between"
+        value = self._take(name, words)
+        chosen = tuple(value.split("+")) if value else ()
+        if value and not set(chosen) <= set(allowed):
+            raise self._refuse(name, value, words)
+        return chosen
+
     def integer(self, name: str, default: int, low: int, high: int) -> int:
         """A whole number from `low` to `high`."""
         allowed = f"a whole number from {low} to {high}"
@@ -86,6 +95,17 @@ class Options:
         if not low <= number <= high:  # NaN fails as well
             raise self._refuse(name, value, allowed)
         return number
+
+    def change(self, name: str, allowed: Sequence[str]) -> tuple[str, int] | None:
+        """One of the words `allowed` and a frame's number, written ``word@20``; None by default."""
+        words = f"one of {', '.join(allowed)}, @ and the number of a frame, such as {allowed[0]}@20"
+        value = self._take(name, words)
+        if value is None:
+            return None
+        word, _, number = value.partition("@")
+        if word not in allowed or not (number.isascii() and number.isdecimal() and len(number) < 9):
+            raise self._refuse(name, value, words)
+        return word, int(number)
 
     def size(self, name: str, default: tuple[int, int]) -> tuple[int, int]:
         """Width and height in pixels, written ``640x480``."""

@@ -93,6 +93,7 @@ def kinect_depth(
     albedo: npt.NDArray[np.float32],
     camera: Camera,
     seed: int,
+    fixed_seed: int | None = None,
 ) -> DepthArray:
     """Depth image as a Kinect would report it.
 
@@ -107,6 +108,9 @@ def kinect_depth(
     camera : Camera
     seed : int
         The error is a pure function of it and of the scene.
+    fixed_seed : int, optional
+        Of a part of the error, half of its variance, that thus stays in place while `seed` changes:
+        a real sensor's lens and pattern do not change from frame to frame.
 
     Returns
     -------
@@ -114,9 +118,14 @@ def kinect_depth(
         Millimetres, 0 = no measurement.
     """
     height, width = nearness.shape
-    state = np.array([(seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019) % 2**64 or 1], np.uint64)
+    state = _state_of(seed)
     error = _field(1, _ERROR_CELL, height, width, state)
     wobble = _field(3, _WOBBLE_CELL, height, width, state)
+    if fixed_seed is not None:
+        fixed = _state_of(fixed_seed)
+        half = np.float32(math.sqrt(0.5))
+        error = half * (error + _field(1, _ERROR_CELL, height, width, fixed))
+        wobble = half * (wobble + _field(3, _WOBBLE_CELL, height, width, fixed))
     strength = np.empty((height, width), np.float32)
     depth_mm = np.empty((height, width), np.uint16)
     parallax = _parallax(camera)
@@ -127,6 +136,11 @@ def kinect_depth(
     _measure(nearness, matched, error, wobble, parallax, depth_steps(camera), state, depth_mm)
     depth_mm[:, width - math.ceil(_BORDER_PX * width / 640) :] = 0
     return depth_mm
+
+
+def _state_of(seed: int) -> npt.NDArray[np.uint64]:
+    """First state of the random numbers, never 0."""
+    return np.array([(seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019) % 2**64 or 1], np.uint64)
 
 
 def _parallax(camera: Camera) -> float:

@@ -61,6 +61,11 @@ class Shapes:
     second: npt.NDArray[np.float64]
     size: npt.NDArray[np.float64]
 
+    def beside(self, others: Shapes) -> Shapes:
+        """These shapes and others, in the same axes."""
+        names = ("kind", "material", "centre", "first", "second", "size")
+        return Shapes(*(np.concatenate((getattr(self, n), getattr(others, n))) for n in names))
+
     def seen_from(
         self, rotation: npt.NDArray[np.float64], position_mm: npt.NDArray[np.float64]
     ) -> Shapes:

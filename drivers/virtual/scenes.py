@@ -70,7 +70,7 @@ class Scene:
     sway_mm: npt.NDArray[np.float64]
 
 
-class _Builder:
+class Builder:
     """Collects shapes. Angles in degrees; yaw turns about y, pitch about the turned x."""
 
     def __init__(self) -> None:
@@ -97,13 +97,13 @@ class _Builder:
         self, material: Material, centre: Vector, size: Vector, yaw: float = 0, pitch: float = 0
     ) -> None:
         """Six quads, each facing outwards."""
-        turn = _turn(yaw, pitch)
+        turn = turn_of(yaw, pitch)
         for k in range(3):
             one, two = (k + 1) % 3, (k + 2) % 3
             for sign in (1.0, -1.0):
                 middle = np.array(centre) + sign * size[k] / 2 * turn[:, k]
                 first, second = turn[:, one], sign * turn[:, two]
-                self.quad(material, _v(middle), _v(first), _v(second), size[one], size[two])
+                self.quad(material, vector_of(middle), vector_of(first), vector_of(second), size[one], size[two])
 
     def sphere(self, material: Material, centre: Vector, radius: float) -> None:
         """A ball."""
@@ -115,7 +115,7 @@ class _Builder:
         """A cylinder with flat, round or open ends."""
         a, b = np.array(start), np.array(end)
         length = float(np.linalg.norm(b - a))
-        axis, middle = _v((b - a) / length), _v((a + b) / 2)
+        axis, middle = vector_of((b - a) / length), vector_of((a + b) / 2)
         self._add(CYLINDER, material, middle, axis, size=(radius, length / 2))
         for point in (start, end):
             if ends == "flat":
@@ -161,11 +161,11 @@ class _Builder:
         )
 
 
-def _v(vector: npt.NDArray[np.float64]) -> Vector:
+def vector_of(vector: npt.NDArray[np.float64]) -> Vector:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
-def _turn(yaw: float, pitch: float) -> npt.NDArray[np.float64]:
+def turn_of(yaw: float, pitch: float) -> npt.NDArray[np.float64]:
     """Rotation about y by `yaw`, then about the turned x by `pitch`, degrees."""
     a, b = math.radians(yaw), math.radians(pitch)
     about_y = np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
@@ -176,7 +176,7 @@ def _turn(yaw: float, pitch: float) -> npt.NDArray[np.float64]:
 
 def workstation() -> Scene:
     """A desk with two monitors, keyboard and shelf, a chair before it, a tower below."""
-    b = _Builder()
+    b = Builder()
     floor, desk = 1250.0, 500.0
     b.room(floor, 2600, -1900, 1700)
     # The desk: top, two side panels, a modesty panel, a pedestal with drawers.
@@ -195,14 +195,14 @@ def workstation() -> Scene:
     b.box(Material.BLACK, (520, floor - 220, 2200), (190, 440, 460))
     # Two monitors, turned towards the user, screens set back in their frames.
     for x, yaw in ((-330, 14), (300, -16)):
-        turn = _turn(yaw, 0)
+        turn = turn_of(yaw, 0)
         foot = np.array((x, desk, 2270.0))
         b.box(Material.PLASTIC, (x, desk - 8, 2270), (240, 16, 190), yaw)
-        b.box(Material.PLASTIC, _v(foot + turn @ (0, -110, 40)), (70, 200, 30), yaw)
+        b.box(Material.PLASTIC, vector_of(foot + turn @ (0, -110, 40)), (70, 200, 30), yaw)
         middle = foot + turn @ (0, -290, 0)
-        b.box(Material.PLASTIC, _v(middle), (540, 345, 40), yaw)
+        b.box(Material.PLASTIC, vector_of(middle), (540, 345, 40), yaw)
         screen = middle + turn @ (0, 0, -20.5)
-        b.quad(Material.SCREEN, _v(screen), _v(turn[:, 1]), _v(turn[:, 0]), 300, 500)
+        b.quad(Material.SCREEN, vector_of(screen), vector_of(turn[:, 1]), vector_of(turn[:, 0]), 300, 500)
     # On the desk.
     b.box(Material.BLACK, (-60, desk - 12, 1900), (450, 24, 150), 4, 4)
     b.rod(Material.PLASTIC, (290, desk - 18, 1900), (300, desk - 18, 1945), 19, "round")
@@ -223,11 +223,11 @@ def workstation() -> Scene:
         at += wide + (3 if k % 5 else 45)
     b.box(Material.PAINT, (330, -330, 2490), (300, 190, 200), 10)
     # An office chair, turned a little.
-    turn = _turn(-28, 0)
+    turn = turn_of(-28, 0)
     chair = np.array((430, floor, 1520.0))
 
     def on_chair(x: float, y: float, z: float) -> Vector:
-        return _v(chair + turn @ np.array((x, -y, z)))
+        return vector_of(chair + turn @ np.array((x, -y, z)))
 
     b.box(Material.CLOTH, on_chair(0, 470, 0), (470, 80, 450), -28)
     b.box(Material.CLOTH, on_chair(0, 800, -235), (440, 480, 60), -28, -8)
@@ -246,7 +246,7 @@ def workstation() -> Scene:
 
 def exercise_ball() -> Scene:
     """A large exercise ball on a mat before a wall with a door and a radiator."""
-    b = _Builder()
+    b = Builder()
     floor = 1150.0
     b.room(floor, 2550, -2100, 2000)
     b.box(Material.WALL, (-50, floor - 45, 2542), (4100, 90, 16))
@@ -254,12 +254,12 @@ def exercise_ball() -> Scene:
     b.sphere(Material.RUBBER, (0, floor - 12 - 325, 1750), 325)
     b.rod(Material.BLACK, (0, floor - 12 - 325, 1422), (0, floor - 12 - 325, 1460), 11)
     for x, z, yaw in ((-560, 1500, 35), (520, 1420, -60)):
-        turn = _turn(yaw, 0)
+        turn = turn_of(yaw, 0)
         grip = np.array((x, floor - 62, float(z)))
-        b.rod(Material.METAL, _v(grip - turn[:, 0] * 75), _v(grip + turn[:, 0] * 75), 15)
+        b.rod(Material.METAL, vector_of(grip - turn[:, 0] * 75), vector_of(grip + turn[:, 0] * 75), 15)
         for sign in (-1, 1):
             inner, outer = grip + sign * turn[:, 0] * 70, grip + sign * turn[:, 0] * 135
-            b.rod(Material.RUBBER, _v(inner), _v(outer), 52)
+            b.rod(Material.RUBBER, vector_of(inner), vector_of(outer), 52)
     # The door in its frame.
     b.box(Material.WOOD, (-1050, floor - 1000, 2535), (800, 2000, 20))
     for x in (-1490, -610):
@@ -276,7 +276,7 @@ def exercise_ball() -> Scene:
 
 def fire_hose() -> Scene:
     """A fire-hose station: cabinet with a reel, valves and pipes before a flat wall."""
-    b = _Builder()
+    b = Builder()
     floor, wall = 1100.0, 2100.0
     # The flat wall ends at a corridor, whose far end is the widest depth.
     b.quad(Material.FLOOR, (0, floor, 3000), (1, 0, 0), (0, 0, 1), 6000, 8000)

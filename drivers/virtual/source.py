@@ -12,6 +12,7 @@ from selective_depth.drivers.errors import SourceEndedError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
 from selective_depth.drivers.options import Options
 from selective_depth.drivers.source import DepthSource
+from selective_depth.drivers.virtual.moving import MOVING, moving_shapes
 from selective_depth.drivers.virtual.noise import kinect_depth
 from selective_depth.drivers.virtual.renderer import cast
 from selective_depth.drivers.virtual.scenes import ALBEDO, ALIASES, SCENES, Material, Scene
@@ -35,10 +36,13 @@ class VirtualSource(DepthSource):
     ----------
     name : str
         ``workstation``, ``ball`` or ``firehose``; options after ``?``, with ``&`` between:
-        ``noise=kinect`` or ``off`` (the exact depth, rounded to a millimetre);
+        ``noise=kinect``, ``kinect+fixed`` (half of the error stays in place from frame to frame) or
+        ``off`` (the exact depth, rounded to a millimetre);
         ``frames=120``, how many there are (live: no end unless given);
         ``seed=1``, of the camera's path and the sensor's error;
         ``speed=1``, of the camera, 0 = it stands still;
+        ``moving=ball``, or more of `MOVING` with ``+`` between: what else moves;
+        ``cut=ball@20``, to another scene, from that frame on;
         ``size=640x480``, the field of view's width stays that of a Kinect;
         ``live=0`` or ``1``: paced at 30 frames a second like a device, the newest frame wins.
 
@@ -56,10 +60,12 @@ class VirtualSource(DepthSource):
                 f"there is no virtual scene '{asked}'; give virtual: and one of {', '.join(SCENES)}"
             )
         options = Options(text, f"virtual:{asked}")
-        self._noise = options.choice("noise", "kinect", ("kinect", "off")) == "kinect"
+        self._noise = options.choice("noise", "kinect", ("kinect", "kinect+fixed", "off"))
         frames = options.integer("frames", 0, 0, 10_000_000)
         self.seed = options.integer("seed", 1, 0, 2**32 - 1)
         self._speed = options.number("speed", 1.0, 0.0, 100.0)
+        self._moving = options.choices("moving", tuple(MOVING))
+        self._cut = options.change("cut", tuple(SCENES))
         width, height = options.size("size", (640, 480))
         self.live = options.choice("live", "0", ("0", "1")) == "1"
         options.done()
@@ -89,8 +95,9 @@ class VirtualSource(DepthSource):
             raise SourceEndedError(f"all frames of {self.uri} are delivered")
         index = self._next
         self._next += 1
-        depth_mm = self.depth_at(index, noise=self._noise)
-        return DepthFrame(depth_mm, index, round(index * 1e6 / FPS), self.camera, self.uri)
+        depth_mm, truth_mm = self._render(index, noise=self._noise != "off")
+        time_us = round(index * 1e6 / FPS)
+        return DepthFrame(depth_mm, index, time_us, self.camera, self.uri, truth_mm=truth_mm)
 
     def depth_at(self, index: int, *, noise: bool) -> DepthArray:
         """Depth of frame `index`, exact or as a Kinect reports it, whatever was read so far.
@@ -100,13 +107,30 @@ class VirtualSource(DepthSource):
         uint16 array of shape (height, width)
             Millimetres, 0 = no measurement.
         """
-        rotation, position_mm = camera_pose(self._scene, index / FPS * self._speed, self.seed)
-        nearness, material = cast(self._scene.shapes.seen_from(rotation, position_mm), self.camera)
-        if noise:
-            frame_seed = (self.seed << 32) + index + 1
-            return kinect_depth(nearness, material, _ALBEDO, self.camera, frame_seed)
+        return self._render(index, noise=noise)[0]
+
+    def _render(self, index: int, *, noise: bool) -> tuple[DepthArray, DepthArray]:
+        """Depth as asked for, and the exact one."""
+        scene = self._scene
+        if self._cut is not None and index >= self._cut[1]:
+            scene = SCENES[self._cut[0]]()
+        shapes = scene.shapes
+        if self._moving:
+            rotation, position_mm = camera_pose(scene, 0.0, self.seed)
+            moving = moving_shapes(self._moving, index / FPS)
+            # From the first camera's axes to the scene's: a turn is undone by its transpose.
+            shapes = shapes.beside(moving.seen_from(rotation.T, -rotation @ position_mm))
+        rotation, position_mm = camera_pose(scene, index / FPS * self._speed, self.seed)
+        nearness, material = cast(shapes.seen_from(rotation, position_mm), self.camera)
         with np.errstate(divide="ignore"):
-            return np.where(nearness > 0, np.rint(1.0 / nearness), 0).astype(np.uint16)
+            exact = np.where(nearness > 0, np.rint(1.0 / nearness), 0).astype(np.uint16)
+        exact.flags.writeable = False
+        if not noise:
+            return exact, exact
+        frame_seed = (self.seed << 32) + index + 1
+        fixed_seed = (self.seed << 32) if self._noise == "kinect+fixed" else None
+        seen = kinect_depth(nearness, material, _ALBEDO, self.camera, frame_seed, fixed_seed)
+        return seen, exact
 
     def close(self) -> None:
         """No frame follows."""

@@ -1,0 +1,144 @@
+"""What a memory is worth: error over the frames of a source, with it and without."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+
+import numpy as np
+import numpy.typing as npt
+
+from selective_depth.app.evaluation.evaluate import ENDLESS_FRAMES
+from selective_depth.drivers.errors import SourceNotFoundError
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.open import open_source
+from selective_depth.selectors.acquire import acquire
+from selective_depth.selectors.memory import TemporalAcquisition
+from selective_depth.selectors.memory.store import KEPT
+from selective_depth.selectors.seeds import SeedGrid
+
+FIRST_BUDGET = 0.05
+"""Beyond the seeds: of a first frame with memory, and of every frame without."""
+
+WAYS = ("memory", "memoryless", "whole_frame", "median")
+
+
+@dataclass
+class Course:
+    """Errors of one way over the frames of a source, millimetres, one number a frame."""
+
+    rmse_mm: list[float] = field(default_factory=list)
+    mae_mm: list[float] = field(default_factory=list)
+
+    def add(self, model_mm: npt.NDArray[np.generic], truth_mm: npt.NDArray[np.generic],
+            scored: npt.NDArray[np.bool_]) -> None:  # fmt: skip
+        """Take in the model of a frame; where it has no depth it is not scored."""
+        valid = scored & (model_mm > 0)
+        off = model_mm[valid].astype(np.float64) - truth_mm[valid]
+        self.rmse_mm.append(float(np.sqrt(np.mean(off**2))) if off.size else math.nan)
+        self.mae_mm.append(float(np.mean(np.abs(off))) if off.size else math.nan)
+
+
+def _frames(uri: str, limit: int | None) -> Iterator[DepthFrame]:
+    with open_source(uri) as source:
+        most = ENDLESS_FRAMES if source.frame_count is None else None
+        yield from islice(source, limit or most)
+
+
+def _truth(frame: DepthFrame) -> npt.NDArray[np.uint16]:
+    return frame.depth_mm if frame.truth_mm is None else frame.truth_mm
+
+
+def _often_returning(uri: str, frames: int | None) -> npt.NDArray[np.bool_] | None:
+    """Pixels that return depth in more than half of the frames of a still scene, else None."""
+    first: npt.NDArray[np.uint16] | None = None
+    returned, count = np.zeros(1, np.int64), 0
+    for frame in _frames(uri, frames):
+        if frame.truth_mm is None:
+            return None
+        if first is None:
+            first, returned = frame.truth_mm, np.zeros(frame.shape, np.int64)
+        if not np.array_equal(first, frame.truth_mm):
+            return None
+        returned += frame.depth_mm > 0
+        count += 1
+    return None if first is None else returned > count / 2
+
+
+def over_time(
+    uri: str,
+    budget: float,
+    *,
+    frames: int | None = None,
+    seeds_shape: tuple[int, int] = (128, 128),
+    rounds: int = 8,
+    progress: Callable[[int], None] = lambda done: None,
+) -> dict[str, Course]:
+    """Follow a source with memory and without it.
+
+    Parameters
+    ----------
+    uri : str
+        As `open_source` takes it. Errors are against exact truth where the source knows it, else
+        against the frame itself.
+    budget : float
+        All measurements of a frame with memory, after the first, as a share of its pixels.
+    frames : int, optional
+        At most so many.
+    seeds_shape : tuple of int, default (128, 128)
+        Rows and columns of the seed lattice.
+    rounds : int, default 8
+        Rounds of the acquisition without memory.
+    progress : callable, optional
+        Called with the number of frames done.
+
+    Returns
+    -------
+    dict
+        A `Course` for each of `WAYS`: memory; the closed loop of seeds and 5 % more in every frame;
+        the frame as the sensor gives it; the median of the last frames, 31 at most. Scored are the
+        pixels with exact depth that return depth in more than half of the frames; where anything
+        moves, those that return it in the frame.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If the source has no frame.
+    """
+    often = _often_returning(uri, frames)
+    courses = {way: Course() for way in WAYS}
+    memory: TemporalAcquisition | None = None
+    last: deque[npt.NDArray[np.float32]] = deque(maxlen=KEPT)
+    for done, frame in enumerate(_frames(uri, frames)):
+        truth = _truth(frame)
+        scored = truth > 0
+        scored &= (frame.depth_mm > 0) if often is None else often
+        if memory is None:
+            memory = TemporalAcquisition(
+                frame.shape, budget=budget, first_budget=FIRST_BUDGET, seeds=seeds_shape
+            )
+        step = memory.step(frame.measure)
+        courses["memory"].add(step.model_mm, truth, scored)
+        seeds = SeedGrid.from_frame(frame, seeds_shape)
+        loop = acquire(frame.measure, seeds, FIRST_BUDGET, rounds)
+        courses["memoryless"].add(loop.reconstruct(), truth, scored)
+        courses["whole_frame"].add(frame.depth_mm, truth, scored)
+        last.append(np.where(frame.depth_mm > 0, frame.depth_mm, np.float32(np.nan)))
+        courses["median"].add(_median(last), truth, scored)
+        progress(done + 1)
+    if memory is None:
+        raise SourceNotFoundError(f"'{uri}' has no frame; give another source.")
+    return courses
+
+
+def _median(frames: deque[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
+    """Median of what each pixel returned, 0 where it never did."""
+    stack = np.sort(np.stack(frames), axis=0)  # NaN last
+    count = np.count_nonzero(~np.isnan(stack), axis=0)
+    lower = np.take_along_axis(stack, np.maximum(count - 1, 0)[None] // 2, axis=0)[0]
+    upper = np.take_along_axis(stack, np.maximum(count // 2, 0)[None], axis=0)[0]
+    middle: npt.NDArray[np.float32] = np.where(count > 0, (lower + upper) / 2, 0)
+    return middle

@@ -1,0 +1,6 @@
+"""Memory: a model over time, of which every frame measures a part."""
+
+from selective_depth.selectors.memory.temporal import TemporalAcquisition, TemporalStep
+from selective_depth.selectors.memory.worth import Noise
+
+__all__ = ["Noise", "TemporalAcquisition", "TemporalStep"]

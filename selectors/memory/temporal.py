@@ -1,0 +1,337 @@
+"""A model over time: what was measured stays known, and each frame's budget goes where it helps.
+
+The first frame is a plain acquisition. From then on a frame's budget is spent on look-outs, which
+measure a part of the seed lattice again, in turn, and say what has changed; on the outlines of what
+has; and on the pixels, new or known, where a shot is expected to remove most error. Nothing is
+known that was not asked for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import maximum_filter
+
+from selective_depth.selectors.acquire import acquire, shots_of
+from selective_depth.selectors.choice import choose
+from selective_depth.selectors.memory.change import (
+    MARGIN_PX,
+    MOVED_SHARE,
+    NEAR_PX,
+    Extent,
+    around,
+    contradicts,
+    moved,
+)
+from selective_depth.selectors.memory.store import Memory, book, forget
+from selective_depth.selectors.memory.worth import WRONG, Noise, shot_worth
+from selective_depth.selectors.parallel import in_bands
+from selective_depth.selectors.samples import Samples
+from selective_depth.selectors.seeds import Measure, SeedGrid, answers
+from selective_depth.selectors.selection import Selector, Worth, plan_of
+from selective_depth.selectors.triangulation import Surface
+
+CALM_LOOKS, ALERT_LOOKS = 0.15, 0.4
+"""Share of a frame's budget that looks out, in a still scene and for `ALERT_FRAMES` after a
+change."""
+ALERT_FRAMES = 10
+EXTENT_ROUNDS = 3
+"""Rounds of shots along the border of what has changed."""
+FEWEST_CONFIRMED = 2
+"""Of four shots about a contradiction, so many must contradict as well."""
+
+
+@dataclass(frozen=True, eq=False)
+class TemporalStep:
+    """What one frame added to the memory.
+
+    Parameters
+    ----------
+    frame : int
+        Its number, from 0.
+    uv : int32 array of shape (n, 2)
+        Pixels measured in it, column first, each once.
+    depth_mm : float32 array of shape (n,)
+        Their depth; 0 = no return.
+    model_mm : float32 array of shape (H, W)
+        Dense depth of all that is known.
+    known : bool array of shape (H, W)
+        Pixels that have been measured, in this frame or before, and not been forgotten.
+    age_frames : int32 array of shape (H, W)
+        Frames since each of them was measured last; -1 where not known.
+    changed : bool array of shape (H, W)
+        What was forgotten in this frame: where it contradicted the memory, and a margin.
+    restarted : bool
+        Whether all of it was: in the first frame, after a cut, or because the camera moved.
+    by : str
+        Name of the selector that chose new pixels.
+    """
+
+    frame: int
+    uv: npt.NDArray[np.int32]
+    depth_mm: npt.NDArray[np.float32]
+    model_mm: npt.NDArray[np.float32]
+    known: npt.NDArray[np.bool_]
+    age_frames: npt.NDArray[np.int32]
+    changed: npt.NDArray[np.bool_]
+    restarted: bool
+    by: str
+
+
+class _Sensor:
+    """The sensor during one frame: it is asked for a pixel once, and what it said is kept."""
+
+    def __init__(self, measure: Measure, shape: tuple[int, int]) -> None:
+        self._measure = measure
+        self._answer_mm = np.full(shape, np.nan, np.float32)
+        self.uv: list[npt.NDArray[np.int32]] = []
+        self.depth_mm: list[npt.NDArray[np.float32]] = []
+
+    def __call__(self, uv: npt.NDArray[np.integer]) -> npt.NDArray[np.float32]:
+        """Depth of pixels (n, 2), column first; 0 = no return."""
+        u, v = uv[:, 0], uv[:, 1]
+        new = np.isnan(self._answer_mm[v, u])
+        if new.any():
+            asked = np.ascontiguousarray(uv[new], np.int32)
+            _, mm = answers(self._measure, asked)
+            self._answer_mm[asked[:, 1], asked[:, 0]] = mm
+            self.uv.append(asked)
+            self.depth_mm.append(mm)
+        return self._answer_mm[v, u]
+
+    def unasked(self, uv: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+        """Those of some pixels that were not asked for yet."""
+        found: npt.NDArray[np.int32] = uv[np.isnan(self._answer_mm[uv[:, 1], uv[:, 0]])]
+        return found
+
+    @property
+    def spent(self) -> int:
+        """Measurements made in this frame."""
+        return sum(map(len, self.uv))
+
+
+class TemporalAcquisition:
+    """Acquire frame after frame, and remember.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Height and width of the frames.
+    budget : float, default 0.02
+        All measurements of a frame after the first, as a share of its pixels.
+    first_budget : float, default 0.05
+        Measurements of a first frame beyond its seeds: of the very first, and of one in which
+        everything has changed. Such a frame takes no less than `budget` in all.
+    seeds : tuple of int, default (128, 128)
+        Rows and columns of the seed lattice.
+    rounds : int, default 4
+        Rounds of a first frame, and of what has changed.
+    selector : Selector or callable, optional
+        Chooses the new pixels; known ones are measured again by what that is worth (`shot_worth`).
+        By default that worth decides between new and known ones alike.
+    noise : Noise, optional
+        Of the sensor; default a Kinect's.
+    threads : int, optional
+        Kernel threads; default `default_threads()`. The result does not depend on it.
+
+    Raises
+    ------
+    ValueError
+        If a budget or the lattice is out of its range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> wall_mm = np.full((96, 128), 2000, np.uint16)
+    >>> memory = TemporalAcquisition((96, 128), seeds=(24, 32))
+    >>> for _ in range(3):
+    ...     step = memory.step(lambda uv: wall_mm[uv[:, 1], uv[:, 0]])
+    >>> len(step.uv), int(step.known.sum()) > 1382
+    (246, True)
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        *,
+        budget: float = 0.02,
+        first_budget: float = 0.05,
+        seeds: tuple[int, int] = (128, 128),
+        rounds: int = 4,
+        selector: Selector | Worth | None = None,
+        noise: Noise | None = None,
+        threads: int | None = None,
+    ) -> None:
+        self.shape = shape
+        self._shots = shots_of(budget, shape)
+        self._first_shots = shots_of(first_budget, shape)
+        self._rounds = rounds
+        self._selector = selector
+        self._noise = noise or Noise()
+        self._threads = threads
+        nothing = SeedGrid.from_array(np.zeros(shape, np.uint16), seeds)
+        self._seeds_shape = seeds
+        lattice = nothing.lattice_uv.reshape(-1, 2)
+        # In an order of which every part is spread over the frame.
+        self._lattice_uv = lattice[np.random.default_rng(0).permutation(len(lattice))]
+        self._looked = 0
+        pitch_px = max(n / cells for n, cells in zip(shape, seeds, strict=True))
+        self._reach_sq = (1.3 * pitch_px) ** 2
+        self._frame = -1
+        self._alert = 0
+        self._memory = Memory.of(shape)
+        self._surface = Surface(shape, threads)
+        self._by = ""
+
+    def step(self, measure: Measure) -> TemporalStep:
+        """Spend one frame's budget.
+
+        Parameters
+        ----------
+        measure : callable
+            The sensor, as it sees the frame: pixels (n, 2), column first, to depth (n,) in
+            millimetres, 0 = no return. No pixel is asked for twice.
+
+        Raises
+        ------
+        ValueError
+            If the sensor does not answer with one depth per pixel.
+        """
+        self._frame += 1
+        self._alert = max(self._alert - 1, 0)
+        sensor = _Sensor(measure, self.shape)
+        changed = np.zeros(self.shape, np.bool_)
+        restarted = self._frame == 0 or not self._look_out(sensor, changed)
+        if restarted:
+            self._start(sensor)
+            changed[:] = True
+        else:
+            if changed.any():
+                self._alert = ALERT_FRAMES
+                forget(self._memory, changed)
+            self._book(sensor, 0)
+            self._draw(anew=bool(changed.any()))
+            rounds = self._rounds if changed.any() else 1
+            for left in range(rounds, 0, -1):
+                self._measure_best(sensor, (self._shots - sensor.spent) // left)
+        return self._told(sensor, changed, restarted)
+
+    def _look_out(self, sensor: _Sensor, changed: npt.NDArray[np.bool_]) -> bool:
+        """Look whether all is as it was, and fill in where not; False if nothing is."""
+        share = ALERT_LOOKS if self._alert else CALM_LOOKS
+        count = min(round(share * self._shots), len(self._lattice_uv))
+        turn = (self._looked + np.arange(count)) % len(self._lattice_uv)
+        self._looked += count
+        uv = self._lattice_uv[turn]
+        mm = sensor(uv)
+        model_mm = self._surface.layers.depth_mm
+        against = contradicts(uv, mm, model_mm)
+        z = model_mm[uv[:, 1], uv[:, 0]]
+        noise_mm = self._noise.floor_mm + self._noise.per_mm * z * z
+        if moved(uv, mm, model_mm, against, noise_mm) > MOVED_SHARE:
+            return False
+        if not against.any():
+            return True
+        beside = around(uv[against], self.shape)[: self._shots - sensor.spent]
+        beside_against = contradicts(beside, sensor(beside), model_mm)
+        extent = Extent(self.shape)
+        doubted = uv[against]
+        votes = np.zeros(self.shape, np.uint8)
+        votes[beside[beside_against, 1], beside[beside_against, 0]] = 1
+        confirmed = _votes_about(doubted, votes) >= FEWEST_CONFIRMED
+        extent.add(uv[~against], np.zeros(int((~against).sum()), np.bool_))
+        extent.add(beside, beside_against & bool(confirmed.any()))
+        extent.add(doubted, confirmed)
+        if not confirmed.any():
+            return True
+        for left in range(EXTENT_ROUNDS, 0, -1):
+            _, border_px = extent.changed()
+            shots = (self._shots - sensor.spent) // (left + 1)
+            new = sensor.unasked(choose(border_px, shots, threads=self._threads))
+            extent.add(new, contradicts(new, sensor(new), model_mm))
+        where, _ = extent.changed()
+        side = 2 * MARGIN_PX + 1
+        changed[:] = maximum_filter(where, side)
+        return True
+
+    def _start(self, sensor: _Sensor) -> None:
+        """Forget everything, and acquire the frame as if it were the first."""
+        self._memory = Memory.of(self.shape)
+        seeds = SeedGrid.measured(sensor, self.shape, self._seeds_shape)
+        spent = len(self._lattice_uv)
+        shots = max(self._first_shots, self._shots - spent)
+        acquisition = acquire(
+            sensor, seeds, rounds=self._rounds, selector=self._selector, shots=shots,
+            threads=self._threads,
+        )  # fmt: skip
+        self._by = acquisition.by
+        self._book(sensor, 0)
+        self._draw(anew=True)
+
+    def _book(self, sensor: _Sensor, first: int) -> None:
+        """Take in this frame's answers from number `first` on."""
+        for uv, mm in zip(sensor.uv[first:], sensor.depth_mm[first:], strict=True):
+            book(self._memory, uv, mm, self._frame)
+
+    def _draw(self, *, anew: bool) -> None:
+        """Draw the model of what is known."""
+        self._surface = Surface(self.shape, self._threads)
+        rows, columns = np.nonzero(self._memory.count)
+        uv = np.stack((columns, rows), axis=-1).astype(np.int32)
+        self._surface.add(uv, self._memory.fused_mm[rows, columns])
+
+    def _measure_best(self, sensor: _Sensor, shots: int) -> None:
+        """Measure the pixels that are worth most, and draw what comes of it."""
+        if shots <= 0:
+            return
+        worth = np.empty(self.shape, np.float32)
+        layers, noise = self._surface.layers, (self._noise.floor_mm, self._noise.per_mm)
+
+        def band(first_row: int, end_row: int) -> None:
+            shot_worth(
+                first_row, end_row, self._memory, layers.depth_mm, layers.gap_sq, self._reach_sq,
+                noise, self._frame, WRONG, worth,
+            )  # fmt: skip
+
+        in_bands(band, self.shape[0], self._threads)
+        first = len(sensor.uv)
+        if self._selector is not None:
+            samples = Samples(self.shape, (self._reach_sq**0.5) / 1.3)
+            rows, columns = np.nonzero(self._memory.count)
+            samples.add(np.stack((columns, rows), axis=-1), self._memory.fused_mm[rows, columns])
+            new = plan_of(self._selector, samples, self._threads).best(shots // 2)
+            sensor(sensor.unasked(new))
+            worth[self._memory.count == 0] = 0
+            shots -= shots // 2
+        sensor(choose(worth, shots, threads=self._threads))
+        self._book(sensor, first)
+        self._draw(anew=False)
+
+    def _told(
+        self, sensor: _Sensor, changed: npt.NDArray[np.bool_], restarted: bool
+    ) -> TemporalStep:
+        known = self._memory.count > 0
+        age = np.where(known, self._frame - self._memory.asked, -1).astype(np.int32)
+        return TemporalStep(
+            frame=self._frame,
+            uv=np.concatenate(sensor.uv),
+            depth_mm=np.concatenate(sensor.depth_mm),
+            model_mm=self._surface.layers.depth_mm.copy(),
+            known=known,
+            age_frames=age,
+            changed=changed,
+            restarted=restarted,
+            by=self._by,
+        )
+
+
+def _votes_about(
+    uv: npt.NDArray[np.int32], votes: npt.NDArray[np.uint8]
+) -> npt.NDArray[np.integer]:
+    """How many of the pixels measured beside each contradicted, shape (n,)."""
+    padded = np.pad(votes, NEAR_PX)
+    u, v = uv[:, 0] + NEAR_PX, uv[:, 1] + NEAR_PX
+    beside = ((v, u - NEAR_PX), (v, u + NEAR_PX), (v - NEAR_PX, u), (v + NEAR_PX, u))
+    return np.sum([padded[at] for at in beside], axis=0)
