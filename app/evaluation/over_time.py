@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -33,7 +34,7 @@ class Course:
     rmse_mm: list[float] = field(default_factory=list)
     mae_mm: list[float] = field(default_factory=list)
 
-    def add(self, model_mm: npt.NDArray[np.generic], truth_mm: npt.NDArray[np.generic],
+    def add(self, model_mm: npt.NDArray[Any], truth_mm: npt.NDArray[Any],
             scored: npt.NDArray[np.bool_]) -> None:  # fmt: skip
         """Take in the model of a frame; where it has no depth it is not scored."""
         valid = scored & (model_mm > 0)
@@ -91,7 +92,7 @@ def over_time(
     seeds_shape : tuple of int, default (128, 128)
         Rows and columns of the seed lattice.
     rounds : int, default 8
-        Rounds of the acquisition without memory.
+        Rounds of the acquisition without memory, and of a first frame with it.
     progress : callable, optional
         Called with the number of frames done.
 
@@ -118,7 +119,11 @@ def over_time(
         scored &= (frame.depth_mm > 0) if often is None else often
         if memory is None:
             memory = TemporalAcquisition(
-                frame.shape, budget=budget, first_budget=FIRST_BUDGET, seeds=seeds_shape
+                frame.shape,
+                budget=budget,
+                first_budget=FIRST_BUDGET,
+                seeds=seeds_shape,
+                rounds=rounds,
             )
         step = memory.step(frame.measure)
         courses["memory"].add(step.model_mm, truth, scored)

@@ -31,6 +31,11 @@ def ball(b: Builder, time_s: float) -> None:
     _ball(b, BALL_MM_S * time_s - OUTSIDE_MM)
 
 
+def second_ball(b: Builder, time_s: float) -> None:
+    """Another ball of that size crosses lower, from the right, 1.9 m away."""
+    b.sphere(Material.RUBBER, (OUTSIDE_MM - BALL_MM_S * time_s, 350.0, 1900.0), BALL_MM)
+
+
 def stopping_ball(b: Builder, time_s: float) -> None:
     """The same ball stops in mid-view after 0.9 s."""
     _ball(b, BALL_MM_S * min(time_s, STOPPED_S) - OUTSIDE_MM)
@@ -38,7 +43,9 @@ def stopping_ball(b: Builder, time_s: float) -> None:
 
 def person(b: Builder, time_s: float) -> None:
     """A box of a person's size walks from the right at 1 m/s, 1.9 m away."""
-    b.box(Material.CLOTH, (1.2 * OUTSIDE_MM - PERSON_MM_S * time_s, 250.0, 1900.0), (450, 1700, 300))
+    b.box(
+        Material.CLOTH, (1.2 * OUTSIDE_MM - PERSON_MM_S * time_s, 250.0, 1900.0), (450, 1700, 300)
+    )
 
 
 def chair(b: Builder, time_s: float) -> None:
@@ -54,6 +61,7 @@ def chair(b: Builder, time_s: float) -> None:
 
 MOVING: dict[str, Callable[[Builder, float], None]] = {
     "ball": ball,
+    "second-ball": second_ball,
     "stopping-ball": stopping_ball,
     "person": person,
     "chair": chair,

@@ -103,7 +103,14 @@ class Builder:
             for sign in (1.0, -1.0):
                 middle = np.array(centre) + sign * size[k] / 2 * turn[:, k]
                 first, second = turn[:, one], sign * turn[:, two]
-                self.quad(material, vector_of(middle), vector_of(first), vector_of(second), size[one], size[two])
+                self.quad(
+                    material,
+                    vector_of(middle),
+                    vector_of(first),
+                    vector_of(second),
+                    size[one],
+                    size[two],
+                )
 
     def sphere(self, material: Material, centre: Vector, radius: float) -> None:
         """A ball."""
@@ -162,6 +169,7 @@ class Builder:
 
 
 def vector_of(vector: npt.NDArray[np.float64]) -> Vector:
+    """An array of three numbers as a tuple."""
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
@@ -202,7 +210,14 @@ def workstation() -> Scene:
         middle = foot + turn @ (0, -290, 0)
         b.box(Material.PLASTIC, vector_of(middle), (540, 345, 40), yaw)
         screen = middle + turn @ (0, 0, -20.5)
-        b.quad(Material.SCREEN, vector_of(screen), vector_of(turn[:, 1]), vector_of(turn[:, 0]), 300, 500)
+        b.quad(
+            Material.SCREEN,
+            vector_of(screen),
+            vector_of(turn[:, 1]),
+            vector_of(turn[:, 0]),
+            300,
+            500,
+        )
     # On the desk.
     b.box(Material.BLACK, (-60, desk - 12, 1900), (450, 24, 150), 4, 4)
     b.rod(Material.PLASTIC, (290, desk - 18, 1900), (300, desk - 18, 1945), 19, "round")
@@ -256,7 +271,9 @@ def exercise_ball() -> Scene:
     for x, z, yaw in ((-560, 1500, 35), (520, 1420, -60)):
         turn = turn_of(yaw, 0)
         grip = np.array((x, floor - 62, float(z)))
-        b.rod(Material.METAL, vector_of(grip - turn[:, 0] * 75), vector_of(grip + turn[:, 0] * 75), 15)
+        b.rod(
+            Material.METAL, vector_of(grip - turn[:, 0] * 75), vector_of(grip + turn[:, 0] * 75), 15
+        )
         for sign in (-1, 1):
             inner, outer = grip + sign * turn[:, 0] * 70, grip + sign * turn[:, 0] * 135
             b.rod(Material.RUBBER, vector_of(inner), vector_of(outer), 52)

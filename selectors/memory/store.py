@@ -37,7 +37,7 @@ class Memory(NamedTuple):
         Observations that returned depth, the newest over the oldest.
     place : uint8 array
         Where in the ring the next one goes.
-    count : uint8 array
+    held : uint8 array
         How many the ring holds; 0 = not known.
     missed : uint8 array
         Shots since the last return that returned nothing.
@@ -53,7 +53,7 @@ class Memory(NamedTuple):
 
     ring_mm: Float32Array
     place: ByteArray
-    count: ByteArray
+    held: ByteArray
     missed: ByteArray
     fused_mm: Float32Array
     dissent: ByteArray
@@ -67,7 +67,7 @@ class Memory(NamedTuple):
         return cls(
             ring_mm=np.zeros((*shape, KEPT), np.float32),
             place=small[0],
-            count=small[1],
+            held=small[1],
             missed=small[2],
             fused_mm=np.zeros(shape, np.float32),
             dissent=small[3],
@@ -108,11 +108,13 @@ def _fuse(values: Float32Array, before_mm: float) -> tuple[float, int, float]:
 
 
 @njit(cache=True, nogil=True)
-def book(memory: Memory, uv: npt.NDArray[np.int32], depth_mm: Float32Array, now: int) -> None:
+def book(memory: Memory, uv: npt.NDArray[np.int32], depth_mm: Float32Array, now: int) -> int:
     """Take in measurements of frame `now`: pixels (n, 2), column first, and depth, 0 = no return.
 
-    A pixel that has missed three times, and more often than it had returned, is known no more.
+    A pixel that has missed three times, and more often than it had returned, is known no more; how
+    many became so is returned.
     """
+    lost = 0
     values = np.empty(KEPT, np.float32)
     for i in range(len(uv)):
         u, v, z = uv[i, 0], uv[i, 1], depth_mm[i]
@@ -120,24 +122,26 @@ def book(memory: Memory, uv: npt.NDArray[np.int32], depth_mm: Float32Array, now:
         if z <= 0:
             missed = min(memory.missed[v, u] + 1, 255)
             memory.missed[v, u] = missed
-            if missed >= 3 and missed > memory.count[v, u]:
-                memory.count[v, u] = memory.place[v, u] = memory.dissent[v, u] = 0
+            if missed >= 3 and missed > memory.held[v, u] > 0:
+                lost += 1
+                memory.held[v, u] = memory.place[v, u] = memory.dissent[v, u] = 0
                 memory.fused_mm[v, u] = 0
             continue
         memory.missed[v, u] = 0
         place = memory.place[v, u]
         memory.ring_mm[v, u, place] = z
         memory.place[v, u] = (place + 1) % KEPT
-        count = min(memory.count[v, u] + 1, KEPT)
-        memory.count[v, u] = count
+        count = min(memory.held[v, u] + 1, KEPT)
+        memory.held[v, u] = count
         values[:count] = memory.ring_mm[v, u, :count]
         fused, dissent, apart = _fuse(values[:count], memory.fused_mm[v, u])
         memory.fused_mm[v, u] = fused
         memory.dissent[v, u] = dissent
         memory.apart_mm2[v, u] = apart
+    return lost
 
 
 def forget(memory: Memory, where: npt.NDArray[np.bool_]) -> None:
     """Know nothing of some pixels any more."""
-    for layer in (memory.place, memory.count, memory.missed, memory.fused_mm, memory.dissent):
+    for layer in (memory.place, memory.held, memory.missed, memory.fused_mm, memory.dissent):
         layer[where] = 0

@@ -18,12 +18,12 @@ from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.choice import choose
 from selective_depth.selectors.memory.change import (
     MARGIN_PX,
-    MOVED_SHARE,
+    MOVED,
     NEAR_PX,
     Extent,
     around,
     contradicts,
-    moved,
+    drift,
 )
 from selective_depth.selectors.memory.store import Memory, book, forget
 from selective_depth.selectors.memory.worth import WRONG, Noise, shot_worth
@@ -39,6 +39,11 @@ change."""
 ALERT_FRAMES = 10
 EXTENT_ROUNDS = 3
 """Rounds of shots along the border of what has changed."""
+MOST_LOST = 1000
+"""Points that have become holes before the mesh is made anew without them."""
+PROBATION = 8
+"""Frames without a sign of motion before the memory is relied on, where the budget pays for a fresh
+start in every frame: a hand may hold a camera still for a moment."""
 FEWEST_CONFIRMED = 2
 """Of four shots about a contradiction, so many must contradict as well."""
 
@@ -65,6 +70,8 @@ class TemporalStep:
         What was forgotten in this frame: where it contradicted the memory, and a margin.
     restarted : bool
         Whether all of it was: in the first frame, after a cut, or because the camera moved.
+    settled : bool
+        Whether the model is the memory's; else it is of this frame's measurements alone.
     by : str
         Name of the selector that chose new pixels.
     """
@@ -77,6 +84,7 @@ class TemporalStep:
     age_frames: npt.NDArray[np.int32]
     changed: npt.NDArray[np.bool_]
     restarted: bool
+    settled: bool
     by: str
 
 
@@ -99,7 +107,8 @@ class _Sensor:
             self._answer_mm[asked[:, 1], asked[:, 0]] = mm
             self.uv.append(asked)
             self.depth_mm.append(mm)
-        return self._answer_mm[v, u]
+        found: npt.NDArray[np.float32] = self._answer_mm[v, u]
+        return found
 
     def unasked(self, uv: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         """Those of some pixels that were not asked for yet."""
@@ -181,8 +190,13 @@ class TemporalAcquisition:
         self._reach_sq = (1.3 * pitch_px) ** 2
         self._frame = -1
         self._alert = 0
+        # Where a frame's budget does not pay for a fresh start, the memory is relied on at once.
+        affordable = self._shots >= seeds[0] * seeds[1] + self._first_shots
+        self._probation = PROBATION if affordable else 0
+        self._still = 0
         self._memory = Memory.of(shape)
         self._surface = Surface(shape, threads)
+        self._lost = 0
         self._by = ""
 
     def step(self, measure: Measure) -> TemporalStep:
@@ -203,20 +217,39 @@ class TemporalAcquisition:
         self._alert = max(self._alert - 1, 0)
         sensor = _Sensor(measure, self.shape)
         changed = np.zeros(self.shape, np.bool_)
+        self._still += 1
         restarted = self._frame == 0 or not self._look_out(sensor, changed)
         if restarted:
-            self._start(sensor)
+            self._memory = Memory.of(self.shape)
+            self._still = 0
             changed[:] = True
+        settled = self._probation < self._still
+        model_mm = None
+        if restarted or not settled:
+            model_mm = self._start(sensor)
         else:
             if changed.any():
                 self._alert = ALERT_FRAMES
                 forget(self._memory, changed)
-            self._book(sensor, 0)
-            self._draw(anew=bool(changed.any()))
+            self._book(sensor, 0, anew=bool(changed.any()))
             rounds = self._rounds if changed.any() else 1
             for left in range(rounds, 0, -1):
                 self._measure_best(sensor, (self._shots - sensor.spent) // left)
-        return self._told(sensor, changed, restarted)
+        if model_mm is None:
+            model_mm = self._surface.layers.depth_mm.copy()
+        known = self._memory.held > 0
+        return TemporalStep(
+            frame=self._frame,
+            uv=np.concatenate(sensor.uv),
+            depth_mm=np.concatenate(sensor.depth_mm),
+            model_mm=model_mm,
+            known=known,
+            age_frames=np.where(known, self._frame - self._memory.asked, -1).astype(np.int32),
+            changed=changed,
+            restarted=restarted,
+            settled=settled,
+            by=self._by,
+        )
 
     def _look_out(self, sensor: _Sensor, changed: npt.NDArray[np.bool_]) -> bool:
         """Look whether all is as it was, and fill in where not; False if nothing is."""
@@ -230,7 +263,7 @@ class TemporalAcquisition:
         against = contradicts(uv, mm, model_mm)
         z = model_mm[uv[:, 1], uv[:, 0]]
         noise_mm = self._noise.floor_mm + self._noise.per_mm * z * z
-        if moved(uv, mm, model_mm, against, noise_mm) > MOVED_SHARE:
+        if drift(uv, mm, model_mm, noise_mm) > MOVED:
             return False
         if not against.any():
             return True
@@ -256,9 +289,8 @@ class TemporalAcquisition:
         changed[:] = maximum_filter(where, side)
         return True
 
-    def _start(self, sensor: _Sensor) -> None:
-        """Forget everything, and acquire the frame as if it were the first."""
-        self._memory = Memory.of(self.shape)
+    def _start(self, sensor: _Sensor) -> npt.NDArray[np.float32]:
+        """Acquire the frame as if it were the first, and return the model of it alone."""
         seeds = SeedGrid.measured(sensor, self.shape, self._seeds_shape)
         spent = len(self._lattice_uv)
         shots = max(self._first_shots, self._shots - spent)
@@ -267,20 +299,21 @@ class TemporalAcquisition:
             threads=self._threads,
         )  # fmt: skip
         self._by = acquisition.by
-        self._book(sensor, 0)
-        self._draw(anew=True)
+        self._book(sensor, 0, anew=True)
+        return acquisition.reconstruct(self._threads)
 
-    def _book(self, sensor: _Sensor, first: int) -> None:
-        """Take in this frame's answers from number `first` on."""
-        for uv, mm in zip(sensor.uv[first:], sensor.depth_mm[first:], strict=True):
-            book(self._memory, uv, mm, self._frame)
-
-    def _draw(self, *, anew: bool) -> None:
-        """Draw the model of what is known."""
-        self._surface = Surface(self.shape, self._threads)
-        rows, columns = np.nonzero(self._memory.count)
-        uv = np.stack((columns, rows), axis=-1).astype(np.int32)
-        self._surface.add(uv, self._memory.fused_mm[rows, columns])
+    def _book(self, sensor: _Sensor, first: int, *, anew: bool = False) -> None:
+        """Take in this frame's answers from number `first` on, and draw the model."""
+        uv = np.concatenate([np.empty((0, 2), np.int32), *sensor.uv[first:]])
+        mm = np.concatenate([np.empty(0, np.float32), *sensor.depth_mm[first:]])
+        self._lost += book(self._memory, uv, mm, self._frame)
+        # No point is taken out of a mesh: some that stand in holes by now may stay for a while.
+        if anew or self._lost > MOST_LOST:
+            self._lost = 0
+            self._surface = Surface(self.shape, self._threads)
+            rows, columns = np.nonzero(self._memory.held)
+            uv = np.stack((columns, rows), axis=-1).astype(np.int32)
+        self._surface.put(uv, self._memory.fused_mm[uv[:, 1], uv[:, 0]])
 
     def _measure_best(self, sensor: _Sensor, shots: int) -> None:
         """Measure the pixels that are worth most, and draw what comes of it."""
@@ -299,32 +332,14 @@ class TemporalAcquisition:
         first = len(sensor.uv)
         if self._selector is not None:
             samples = Samples(self.shape, (self._reach_sq**0.5) / 1.3)
-            rows, columns = np.nonzero(self._memory.count)
+            rows, columns = np.nonzero(self._memory.held)
             samples.add(np.stack((columns, rows), axis=-1), self._memory.fused_mm[rows, columns])
             new = plan_of(self._selector, samples, self._threads).best(shots // 2)
             sensor(sensor.unasked(new))
-            worth[self._memory.count == 0] = 0
+            worth[self._memory.held == 0] = 0
             shots -= shots // 2
         sensor(choose(worth, shots, threads=self._threads))
         self._book(sensor, first)
-        self._draw(anew=False)
-
-    def _told(
-        self, sensor: _Sensor, changed: npt.NDArray[np.bool_], restarted: bool
-    ) -> TemporalStep:
-        known = self._memory.count > 0
-        age = np.where(known, self._frame - self._memory.asked, -1).astype(np.int32)
-        return TemporalStep(
-            frame=self._frame,
-            uv=np.concatenate(sensor.uv),
-            depth_mm=np.concatenate(sensor.depth_mm),
-            model_mm=self._surface.layers.depth_mm.copy(),
-            known=known,
-            age_frames=age,
-            changed=changed,
-            restarted=restarted,
-            by=self._by,
-        )
 
 
 def _votes_about(
@@ -334,4 +349,5 @@ def _votes_about(
     padded = np.pad(votes, NEAR_PX)
     u, v = uv[:, 0] + NEAR_PX, uv[:, 1] + NEAR_PX
     beside = ((v, u - NEAR_PX), (v, u + NEAR_PX), (v - NEAR_PX, u), (v + NEAR_PX, u))
-    return np.sum([padded[at] for at in beside], axis=0)
+    votes_for: npt.NDArray[np.integer] = np.sum([padded[at] for at in beside], axis=0)
+    return votes_for

@@ -109,7 +109,7 @@ def shot_worth(
             sigma = floor_mm + per_mm * z * z
             noise_mm2 = sigma * sigma
             step_mm2 = np.float32(0.25) * (high - low) * (high - low)
-            n, shots = memory.count[v, u], memory.count[v, u] + memory.missed[v, u]
+            n, shots = memory.held[v, u], memory.held[v, u] + memory.missed[v, u]
             if n == 0:
                 expected = NEW_STEP * step_mm2 + NEW_FLAT * noise_mm2
             else:

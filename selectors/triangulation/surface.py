@@ -24,6 +24,9 @@ STEP_MM = 50.0
 BRIDGE_PX = 10.0
 """Edge length above which such a triangle does, pixels."""
 
+MANY_TRIANGLES = 20_000
+"""From so many on, triangles are drawn by several threads."""
+
 TILE_PX = 16
 """Side of the square tiles in which changes are booked."""
 
@@ -227,6 +230,34 @@ def _draw(
                     layers.depth_mm[v, u] = (w0 * z0 + at1 * z1 + at2 * z2) * inverse
 
 
+@njit(cache=True, nogil=True)
+def _mark_stars(
+    tri: Int32Array, adj: Int32Array, other: npt.NDArray[np.bool_], changed: npt.NDArray[np.bool_]
+) -> None:
+    """Mark the triangles of points whose depth is another now, and those that share an edge."""
+    for t in range(len(tri)):
+        for k in range(3):
+            if tri[t, k] != GHOST and other[tri[t, k]]:
+                changed[t] = True
+                for side in range(3):  # whether it bridges is seen along its edges
+                    changed[adj[t, side]] = True
+                break
+
+
+@njit(cache=True, nogil=True)
+def _renew_far(layers: Layers) -> None:
+    """Give pixels that no plain triangle holds the depth of their nearest sample again."""
+    height, width = layers.depth_mm.shape
+    for v in range(height):
+        for u in range(width):
+            if not layers.plain[v, u]:
+                near = layers.nearest[v, u]
+                z = layers.samples_mm[near // width, near % width]
+                if z != layers.depth_mm[v, u]:
+                    layers.depth_mm[v, u] = z
+                    _touch(layers.touched, v, u, v, u)
+
+
 class Surface:
     """A dense model that samples can be added to.
 
@@ -257,6 +288,7 @@ class Surface:
         )
         self._uv = np.empty((0, 2), np.int32)
         self._depth_mm = np.empty(0, np.float32)
+        self._point = np.full(shape, -1, np.int32)
         self._mesh: Mesh | None = None
 
     def add(self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.generic]) -> None:
@@ -264,12 +296,38 @@ class Surface:
 
         Those without depth (0 or negative) are left out.
         """
+        self._insert(uv, depth_mm)
+        self._draw_changed()
+
+    def put(self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.float32]) -> None:
+        """As `add`, but some of the pixels may have been given before: they get another depth."""
+        point = self._point[uv[:, 1], uv[:, 0]]
+        again = (point >= 0) & (depth_mm > 0)
+        u, v = uv[again, 0], uv[again, 1]
+        differ = depth_mm[again] != self.layers.samples_mm[v, u]
+        if differ.any():
+            self._depth_mm[point[again]] = self.layers.samples_mm[v, u] = depth_mm[again]
+            if self._mesh is not None:
+                other = np.zeros(len(self._uv), np.bool_)
+                other[point[again][differ]] = True
+                end = self._mesh.triangles
+                _mark_stars(
+                    self._mesh.tri[:end], self._mesh.adj[:end], other, self._mesh.changed[:end]
+                )
+        self._insert(uv[point < 0], depth_mm[point < 0])
+        self._draw_changed()
+        if differ.any():
+            _renew_far(self.layers)
+
+    def _insert(self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.generic]) -> None:
+        """Take in samples without drawing them."""
         mm = depth_mm.astype(np.float32)
         returned = mm > 0
         uv, mm = np.ascontiguousarray(uv[returned], np.int32), mm[returned]
         if not len(uv):
             return
         layers, first = self.layers, not len(self._uv)
+        self._point[uv[:, 1], uv[:, 0]] = np.arange(len(self._uv), len(self._uv) + len(uv))
         self._uv = np.concatenate((self._uv, uv))
         self._depth_mm = np.concatenate((self._depth_mm, mm))
         layers.samples_mm[uv[:, 1], uv[:, 0]] = mm
@@ -285,11 +343,16 @@ class Surface:
             self._mesh = Mesh.of(self._uv, 2 * len(self._uv), layers.depth_mm.shape)
         else:
             if len(self._uv) > len(self._mesh.uv):
+                changed = np.zeros(4 * len(self._uv), np.bool_)
+                changed[: len(self._mesh.changed)] = self._mesh.changed
                 self._mesh = self._mesh.copy(2 * len(self._uv))
-                self._mesh.changed[:] = False
+                self._mesh.changed[:] = changed
             self._mesh.add(uv)
-        mesh = self._mesh
-        if mesh is None:  # all on one line
+
+    def _draw_changed(self) -> None:
+        """Draw the triangles that were made or reshaped, or whose corners have another depth."""
+        mesh, layers = self._mesh, self.layers
+        if mesh is None:  # nothing, or all on one line
             return
         changed = np.flatnonzero(mesh.changed[: mesh.triangles])
         inside = (mesh.tri[changed] != GHOST).all(axis=1)
@@ -301,4 +364,5 @@ class Surface:
             part = drawn[begin:end]
             _draw(layers, mesh.uv, self._depth_mm, mesh.tri, mesh.adj, part, limits)
 
-        in_bands(draw, len(drawn), self._threads if first else 1)
+        # Of few triangles, beginning threads would take longer.
+        in_bands(draw, len(drawn), self._threads if len(drawn) > MANY_TRIANGLES else 1)
