@@ -137,6 +137,9 @@ class AcquireOptions:
     """Further measurements as a share of the frame's pixels, 0..1; 0 takes none."""
     rounds: Rounds = 2
     """Rounds in which they are taken, each knowing what the last one found."""
+    memory: Literal["off", "still"] = "off"
+    """still: what was measured stays known, for a camera that stands still; then the budget is all
+    that a frame measures after the first, whose seeds and 5 % more begin it."""
     by: Annotated[str, arg(metavar="NAME")] = "auto"
     """What drives the shots: auto (the best there is), surface, step, improvement, neural-gas,
     neural-gas-edges, even, or FILE.py:NAME, a selector of your own."""
@@ -162,6 +165,8 @@ class ViewerOptions:
     """Open no viewer window."""
     save: Annotated[Path | None, optional("FILE.rrd")] = None
     """Write everything to a Rerun recording, with the settings and a picture beside it."""
+    save_model: Annotated[Path | None, optional("DIR")] = None
+    """At the end, write the last model: cloud.ply, depth.png and samples.npz."""
     serve: Flag = False
     """Serve a stream that viewers can join; a replay is served until Ctrl-C."""
     serve_address: Annotated[str | None, optional("HOST:PORT")] = None
@@ -207,6 +212,8 @@ class ComparisonOptions:
     strategies: Annotated[tuple[str, ...], arg(metavar="NAME...")] = ("main",)
     """What is compared: main, all, names out of the table, or FILE.py:NAME, a selector of your
     own; uniform and oracle always are."""
+    over_time: Flag = False
+    """Follow every frame of each source with a memory instead, which spends the first budget."""
     random_seeds: Count = 3
     """How often strategies that draw at random are run."""
     jobs: Limit = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from selective_depth.app.commands.snapshot import nth_frame
 from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import make_folder, write_output
 from selective_depth.app.pictures import palette
-from selective_depth.app.pipeline import say
+from selective_depth.app.pipeline import FrameResult, say
 from selective_depth.app.pipeline.selecting import selector_of
 from selective_depth.app.settings import Settings
 from selective_depth.drivers.frame import Camera
@@ -106,8 +107,15 @@ def save_samples(path: Path, acquisition: Acquisition) -> None:
     write_output(path, packed.getvalue())
 
 
-def save_model(folder: Path, acquisition: Acquisition, camera: Camera) -> list[Path]:
+def save_model(
+    folder: Path,
+    acquisition: Acquisition,
+    camera: Camera,
+    depth_mm: npt.NDArray[np.floating] | None = None,
+) -> list[Path]:
     """Write ``cloud.ply``, ``depth.png`` and ``samples.npz`` into a folder, made if missing.
+
+    The dense depth is that of the samples, unless another is given.
 
     Raises
     ------
@@ -117,9 +125,29 @@ def save_model(folder: Path, acquisition: Acquisition, camera: Camera) -> list[P
     make_folder(folder)
     cloud, depth, samples = (folder / n for n in ("cloud.ply", "depth.png", "samples.npz"))
     save_cloud(cloud, acquisition, camera)
-    save_depth(depth, acquisition.reconstruct())
+    save_depth(depth, acquisition.reconstruct() if depth_mm is None else depth_mm)
     save_samples(samples, acquisition)
     return [cloud, depth, samples]
+
+
+def save_result(folder: Path, result: FrameResult) -> list[Path]:
+    """Write the model of a run's frame as `save_model` does; of a memory, all that it knows.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    acquisition = result.acquisition
+    assert acquisition is not None  # there is a budget
+    if result.memory is not None:
+        known_mm = result.memory.known_mm
+        rows, columns = np.nonzero(known_mm)
+        uv = np.stack((columns, rows), axis=-1).astype(np.int32)
+        rounds = np.zeros(len(uv), np.uint8)
+        acquisition = replace(acquisition, uv=uv, depth_mm=known_mm[rows, columns], round=rounds)
+    depth_mm = acquisition.reconstruct() if result.model is None else result.model.depth_mm
+    return save_model(folder, acquisition, result.frame.camera, depth_mm)
 
 
 def model_frame(source: str, out: Path, number: int, settings: Settings) -> int:

@@ -11,6 +11,9 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
+
+from selective_depth.app.commands.model import save_result
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
@@ -75,6 +78,8 @@ def check(settings: Settings) -> None:
         raise UsageError(f"--far-mm is {far_mm}; it must be more than --near-mm, {near_mm}.")
     if seen.save is not None:
         _check_save(seen.save)
+    if seen.save_model is not None and not settings.acquire.budget:
+        raise UsageError("--save-model writes what a --budget acquires; give one, such as 5%.")
 
 
 def _beside(saved: Path) -> tuple[Path, Path]:
@@ -167,6 +172,8 @@ class Session:
                 report.stages = pipeline.times.summary()
             if seen.save is not None and self.last is not None:
                 self._write_beside(seen.save)
+            if seen.save_model is not None and self.last is not None:
+                report.written += save_result(seen.save_model, self.last)
         return self._code
 
     def _open_viewer(self, pipeline: Pipeline, frames: int | None) -> Viewer:
@@ -249,7 +256,12 @@ class Session:
             quantisation_error_mm=result.regions.quantisation_error_mm,
         )
         if result.model is not None:
-            result.figures["rmse_mm"] = result.model.rmse_mm
+            for name in ("rmse_mm", "truth_rmse_mm", "sensor_rmse_mm"):
+                result.figures[name] = getattr(result.model, name)
+        if result.memory is not None:
+            size = result.frame.depth_mm.size
+            result.figures["measured"] = 100 * len(result.memory.uv) / size
+            result.figures["known"] = 100 * np.count_nonzero(result.memory.known) / size
         result.stages_ms.update(pipeline.times.last_ms() | result.stages_ms)
         self.report.take(result)
         self.report.seconds = now_s - self._ready_s

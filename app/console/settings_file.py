@@ -33,7 +33,7 @@ def to_toml(settings: Settings, *heading: str) -> str:
     replace these.
     """
     tables = dataclasses.asdict(settings)
-    del tables["viewer"]["save"]
+    del tables["viewer"]["save"], tables["viewer"]["save_model"]
     flat = {key: value for name in FLAT_SECTIONS for key, value in tables.pop(name).items()}
     told = "".join(f"# {_one_line(line)}\n" for line in heading)
     return told + tomli_w.dumps(_stated(flat | tables))

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from rich.console import Console
+from rich.table import Table
 
+from selective_depth.app.console.command import colours
+from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.output import write_output
+from selective_depth.app.console.progress import FrameProgress
 from selective_depth.app.evaluation.evaluate import ENDLESS_FRAMES
+from selective_depth.app.pipeline import say
+from selective_depth.app.settings import ComparisonOptions, EvaluationFiles, Settings
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
@@ -147,3 +156,64 @@ def _median(frames: deque[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
     upper = np.take_along_axis(stack, np.maximum(count // 2, 0)[None], axis=0)[0]
     middle: npt.NDArray[np.float32] = np.where(count > 0, (lower + upper) / 2, 0)
     return middle
+
+
+def run_over_time(
+    sources: Sequence[str], options: ComparisonOptions, settings: Settings, files: EvaluationFiles
+) -> None:
+    """Follow each source, show what came of it, and write it as JSON if asked.
+
+    Raises
+    ------
+    UsageError
+        If there is no source or no budget.
+    OutputError
+        If the file cannot be written.
+    """
+    if not sources:
+        raise UsageError("no source was named; give recordings, folders or scenes.")
+    if not options.budget:
+        raise UsageError("--budget names no share; give one, such as 2%.")
+    found: dict[str, dict[str, Course]] = {}
+    for uri in sources:
+        with FrameProgress(f"Following {uri}", options.frames) as bar:
+            found[uri] = over_time(
+                uri,
+                float(options.budget[0]),
+                frames=options.frames,
+                seeds_shape=(settings.seeds.rows, settings.seeds.columns),
+                rounds=options.rounds,
+                progress=bar.update,
+            )
+        _print(uri, found[uri], float(options.budget[0]))
+    if files.json is not None:
+        document = {
+            "over_time": {
+                uri: {way: asdict(course) for way, course in ways.items()}
+                for uri, ways in found.items()
+            },
+            "budget": options.budget[0],
+        }
+        write_output(files.json, json.dumps(document, indent=1) + "\n")
+        say(f"wrote {files.json}")
+
+
+def _print(uri: str, ways: dict[str, Course], budget: float) -> None:
+    console = Console(highlight=False, no_color=not colours())
+    count = len(ways["memory"].rmse_mm)
+    shown = Table(
+        title=f"{uri}: {count} frames, {100 * budget:g} % of the pixels a frame with memory",
+        title_justify="left",
+        box=None,
+        padding=(0, 0, 0, 2),
+    )
+    shown.add_column("RMSE / MAE, mm, at frame")
+    at = sorted({0, *(n - 1 for n in (5, 10, 20, 30) if n < count), count - 1})
+    for index in at:
+        shown.add_column(str(index), justify="right")
+    shown.add_column("mean", justify="right")
+    for way, course in ways.items():
+        cells = [f"{course.rmse_mm[i]:.1f} / {course.mae_mm[i]:.1f}" for i in at]
+        mean = f"{np.nanmean(course.rmse_mm):.1f} / {np.nanmean(course.mae_mm):.1f}"
+        shown.add_row(way.replace("_", " "), *cells, mean, style="bold" if way == "memory" else "")
+    console.print(shown)

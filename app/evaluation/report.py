@@ -21,6 +21,7 @@ from selective_depth.app.evaluation.evaluate import (
     summarise,
 )
 from selective_depth.app.evaluation.files import check_table, curves, to_json, write_table
+from selective_depth.app.evaluation.over_time import run_over_time
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategy_of
 from selective_depth.app.pictures import Panel, sheet, write_picture
 from selective_depth.app.pictures.panels import error_panel, shots_panel
@@ -57,7 +58,7 @@ def run_evaluation(
     *,
     files: EvaluationFiles,
     page: PictureOptions,
-) -> Results:
+) -> None:
     """Evaluate, show the table and write what was asked for.
 
     Raises
@@ -70,6 +71,8 @@ def run_evaluation(
         check_picture(picture)
     check_output(files.json, files.page)
     check_table(files.table)
+    if options.over_time:
+        return run_over_time(sources, options, settings, files)
     budgets, rounds = options.budget, options.rounds
     seeds_shape = settings.seeds.rows, settings.seeds.columns
     with FrameProgress("Evaluating", None) as bar:
@@ -110,7 +113,6 @@ def run_evaluation(
     for path in (files.json, files.table, files.page, files.picture, files.curves):
         if path is not None:
             say(f"wrote {path}")
-    return results
 
 
 def _percent(budget: str) -> str:

@@ -51,12 +51,14 @@ ERROR = Scale("model error", "inferno", (0.0, 100.0), "mm")
 """Of the model as of the kriging deviation; larger errors share the brightest colour."""
 DEPTH_COLOURMAP: Colourmap = "viridis"
 ROUND_COLOURMAP: Colourmap = "plasma"
+AGE_COLOURMAP: Colourmap = "inferno"
 
 HOLE = 0x6F7480FF
 REGION = 0x26A69AA8
 LONG_EDGE = 0xE6913C6E
 MESH = 0x26A69AFF
 NODE = 0xFFFFFFFF
+FORGOTTEN = 0xD04A4AC0
 """Colours as 0xRRGGBBAA. They differ in lightness too, for colour-blind eyes."""
 UNKNOWN = "no measurement near"
 """What `HOLE` means."""
@@ -82,6 +84,7 @@ From left to right: measured → wanted → acquired → known.
 it selects.
 - **3b Improvement** – where one more measurement would help.
 - **4 Acquired** – what was measured besides, round by round.
+- **4 Known** – with a memory: all that is known, bright where just measured; red where forgotten.
 - **5 Error** – the dense model made of all samples, against the sensor's frame.
 - **In space** – cloud, camera, nodes with their triangles, new samples.
 """
@@ -92,7 +95,11 @@ FIGURES = {
     "dropped_viewer": ("dropped by viewer", 0xCC79A7FF),
     "samples": ("samples", 0x56B4E9FF),
     "quantisation_error_mm": ("quantisation error", 0x26A69AFF),
-    "rmse_mm": ("model RMSE", 0xE69F00FF),
+    "rmse_mm": ("model to the frame", 0xE69F00FF),
+    "truth_rmse_mm": ("model to the truth", 0x56B4E9FF),
+    "sensor_rmse_mm": ("frame to the truth", 0xCC79A7FF),
+    "measured": ("measured in this frame", 0x56B4E9FF),
+    "known": ("known in all", 0x26A69AFF),
 }
 """Running figures of a frame: how a plot calls and colours them."""
 

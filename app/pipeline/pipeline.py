@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import Self
 
-import numpy as np
-
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline.result import FrameResult, Model
 from selective_depth.app.pipeline.selecting import gas_of, improvement_of, selector_of
@@ -22,6 +20,7 @@ from selective_depth.app.settings import Settings
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import Acquisition, acquire
 from selective_depth.selectors.improvement import ImprovementSelection
+from selective_depth.selectors.memory import TemporalAcquisition, TemporalStep
 from selective_depth.selectors.neural_gas import RegionSelection
 from selective_depth.selectors.seeds import SeedGrid
 
@@ -73,11 +72,19 @@ class Pipeline:
         with _as_options("improvement"):
             self._improvement = improvement_of(settings, self._threads)
         self._selector = selector_of(settings, self._threads)
+        self._remembers = settings.acquire.memory == "still"
+        if self._remembers and not settings.acquire.budget:
+            raise UsageError(
+                "--memory still spends a --budget in every frame; give one, such as 2%."
+            )
+        self._memory: TemporalAcquisition | None = None
         self._realtime = realtime
         # The stages are compiled and free of the GIL: side by side they take as long as the
         # longest of them.
         self._beside = ThreadPoolExecutor(2, thread_name_prefix="beside")
         self._modelling = ThreadPoolExecutor(1, thread_name_prefix="model")
+        # One thread: frames enter the memory in their order.
+        self._remembering = ThreadPoolExecutor(1, thread_name_prefix="memory")
         self._under_way: deque[Callable[[], FrameResult]] = deque()
         self._pending: Future[Model] | None = None
         self._since_model = MODEL_EVERY
@@ -89,6 +96,7 @@ class Pipeline:
         self.make(frame)
         if self._pending is not None:
             self._pending.result()
+        self._memory = None
         self.times.clear()
 
     def make(self, frame: DepthFrame) -> FrameResult:
@@ -112,9 +120,16 @@ class Pipeline:
         stages_ms = {"read": read_ms}
         if math.isfinite(read_ms):
             self.times.add("read", read_ms)
-        with self.times.stage("seeds", stages_ms):
-            seeds = self._seeds(frame)
-        modelling = self._beside.submit(self._acquire_and_model, frame, seeds, stages_ms)
+        step: TemporalStep | None = None
+        modelling: Future[tuple[Acquisition | None, Model | None]]
+        if self._remembers:
+            step = self._remembering.submit(self._remember, frame, stages_ms).result()
+            seeds = step.seeds
+            modelling = self._beside.submit(self._told_by, step, frame, stages_ms)
+        else:
+            with self.times.stage("seeds", stages_ms):
+                seeds = self._seeds(frame)
+            modelling = self._beside.submit(self._acquire_and_model, frame, seeds, stages_ms)
         improving = self._beside.submit(self._improve, seeds, stages_ms)
         # In this thread, for the training of a frame begins where the last one's ended.
         regions = self._regions(seeds, stages_ms)
@@ -136,6 +151,7 @@ class Pipeline:
                 improvement=improvement,
                 acquisition=acquisition,
                 model=model,
+                memory=step,
                 state=state,
                 stages_ms=stages_ms | {"loop": loop_ms},
             )
@@ -182,6 +198,31 @@ class Pipeline:
         model = None if self._realtime else self._model(frame, acquisition, stages_ms)
         return acquisition, model
 
+    def _remember(self, frame: DepthFrame, stages_ms: dict[str, float]) -> TemporalStep:
+        options, seeds = self._settings.acquire, self._settings.seeds
+        if self._memory is None:
+            self._memory = TemporalAcquisition(
+                frame.shape,
+                budget=float(options.budget),
+                seeds=(seeds.rows, seeds.columns),
+                rounds=max(options.rounds, 2),
+                selector=None if options.by == "auto" else self._selector,
+                camera=frame.camera,
+                threads=self._threads,
+            )
+        with self.times.stage("acquire", stages_ms):
+            return self._memory.step(frame.measure)
+
+    def _told_by(
+        self, step: TemporalStep, frame: DepthFrame, stages_ms: dict[str, float]
+    ) -> tuple[Acquisition, Model]:
+        """What the memory measured in a frame, and its model held against it."""
+        with self.times.stage("model", stages_ms):
+            acquisition = Acquisition(
+                step.uv, step.depth_mm, step.batch, frame.shape, (), f"{step.by}, with memory"
+            )
+            return acquisition, Model.of(step.model_mm, frame)
+
     def _model_of_some(self, frame: DepthFrame, acquisition: Acquisition) -> Model | None:
         """Begin a model now and then, and return it when it is made."""
         self._since_model += 1
@@ -200,12 +241,7 @@ class Pipeline:
         stages_ms: dict[str, float] | None = None,
     ) -> Model:
         with self.times.stage("model", stages_ms):
-            depth_mm = acquisition.reconstruct(self._threads)
-            error_mm = np.abs(depth_mm - frame.depth_mm.astype(np.float32))
-            error_mm[frame.depth_mm == 0] = np.nan
-            known = error_mm[frame.depth_mm > 0]
-            rmse_mm = float(np.sqrt(np.mean(np.square(known)))) if known.size else float("nan")
-            return Model(depth_mm, error_mm, rmse_mm)
+            return Model.of(acquisition.reconstruct(self._threads), frame)
 
     def __enter__(self) -> Self:
         return self
@@ -218,3 +254,4 @@ class Pipeline:
     ) -> None:
         self._beside.shutdown(cancel_futures=True)
         self._modelling.shutdown(cancel_futures=True)
+        self._remembering.shutdown(cancel_futures=True)

@@ -72,6 +72,9 @@ class RunReport:
     samples: Mean = field(default_factory=Mean)
     quantisation_error_mm: Mean = field(default_factory=Mean)
     rmse_mm: Mean = field(default_factory=Mean)
+    truth_rmse_mm: Mean = field(default_factory=Mean)
+    sensor_rmse_mm: Mean = field(default_factory=Mean)
+    known: Mean = field(default_factory=Mean)
     troubles: list[str] = field(default_factory=list)
     written: list[Path] = field(default_factory=list)
 
@@ -89,6 +92,10 @@ class RunReport:
             self.by = result.acquisition.by
         if result.model is not None:
             self.rmse_mm.add(result.model.rmse_mm)
+            self.truth_rmse_mm.add(result.model.truth_rmse_mm)
+            self.sensor_rmse_mm.add(result.model.sensor_rmse_mm)
+        if result.memory is not None:
+            self.known.add(float(result.memory.known.mean()))
 
 
 def say(sentence: str) -> None:
@@ -118,7 +125,12 @@ def print_report(report: RunReport) -> None:
     if report.by:
         table.add_row("shots chosen by", report.by, "")
     if report.rmse_mm.count:
-        table.add_row("model RMSE", f"{report.rmse_mm.value:.1f}", "mm")
+        table.add_row("model RMSE", f"{report.rmse_mm.value:.1f}", "mm to the frame")
+    if report.truth_rmse_mm.count:
+        table.add_row("", f"{report.truth_rmse_mm.value:.1f}", "mm to the truth")
+        table.add_row("whole frame", f"{report.sensor_rmse_mm.value:.1f}", "mm to the truth")
+    if report.known.count:
+        table.add_row("pixels known", f"{report.known.value:.1%}", "on average")
     console.print(table)
     stages = Table(box=None, pad_edge=False)
     stages.add_column("milliseconds")

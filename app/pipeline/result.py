@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy.typing as npt
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import Acquisition
 from selective_depth.selectors.improvement import ImprovementSelection
+from selective_depth.selectors.memory import TemporalStep
 from selective_depth.selectors.neural_gas import RegionSelection
 from selective_depth.selectors.seeds import SeedGrid
 
@@ -26,11 +28,33 @@ class Model:
         Absolute difference from the full frame; NaN where the frame has no depth.
     rmse_mm : float
         Root mean square of it; NaN for a frame without depth.
+    truth_rmse_mm, sensor_rmse_mm : float
+        The same of the model and of the full frame against exact truth, over pixels of the frame
+        with depth; NaN where no truth is known.
     """
 
     depth_mm: npt.NDArray[np.float32]
     error_mm: npt.NDArray[np.float32]
     rmse_mm: float
+    truth_rmse_mm: float = math.nan
+    sensor_rmse_mm: float = math.nan
+
+    @classmethod
+    def of(cls, depth_mm: npt.NDArray[np.float32], frame: DepthFrame) -> Model:
+        """A model and what it is off from its frame and from the truth."""
+        known = frame.depth_mm > 0
+        error_mm = np.abs(depth_mm - frame.depth_mm.astype(np.float32))
+        error_mm[~known] = np.nan
+        to_truth = (math.nan, math.nan)
+        if frame.truth_mm is not None:
+            seen = known & (frame.truth_mm > 0)
+            truth_mm = frame.truth_mm[seen].astype(np.float32)
+            to_truth = _rms(depth_mm[seen] - truth_mm), _rms(frame.depth_mm[seen] - truth_mm)
+        return cls(depth_mm, error_mm, _rms(error_mm[known]), *to_truth)
+
+
+def _rms(off_mm: npt.NDArray[np.floating]) -> float:
+    return float(np.sqrt(np.mean(np.square(off_mm)))) if off_mm.size else math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +76,9 @@ class FrameResult:
     model : Model or None
         The dense model, where one is at hand: of this frame, or of one shortly before it where
         frames do not wait.
+    memory : TemporalStep or None
+        What the memory came to, where there is one; then `seeds` are what it knows of them, and
+        `acquisition` what was measured in this frame.
     state : str
         The sensor's: live, stalled, lost, reconnecting; or replay.
     stages_ms : dict of str to float
@@ -73,6 +100,7 @@ class FrameResult:
     improvement: ImprovementSelection
     acquisition: Acquisition | None = None
     model: Model | None = None
+    memory: TemporalStep | None = None
     state: str = "replay"
     stages_ms: dict[str, float] = field(default_factory=dict)
     figures: dict[str, float] = field(default_factory=dict)

@@ -12,6 +12,7 @@ def blueprint(
     *,
     by: str | None,
     detail: bool,
+    memory: bool = False,
     look_at_m: float = 2.0,
     limits_mm: tuple[float, float] = (500.0, 5000.0),
 ) -> rrb.Blueprint:
@@ -21,6 +22,8 @@ def blueprint(
     ----------
     by : str or None
         What drives the shots, if a budget is spent: samples, model and error have views only then.
+    memory : bool, default False
+        Whether what is known lasts: its age and what was forgotten have a view then.
     detail : bool
         Whether the inner read-outs have views too.
     look_at_m : float, default 2.0
@@ -43,9 +46,11 @@ def blueprint(
     ]
     space = ["/camera", "/camera/depth", "/world/nodes", "/world/regions"]
     if by is not None:
+        samples = _image(f"4 Acquired by {by}", "samples", "holes")
+        known = _image("4 Known, by age", "memory/age", "memory/changed")
         columns.append(
             rrb.Vertical(
-                _image(f"4 Acquired by {by}", "samples", "holes"),
+                rrb.Tabs(known, samples) if memory else samples,
                 rrb.Tabs(_image("5 Error", "error", "holes"), _image("5 Model", "model")),
             )
         )
@@ -67,7 +72,7 @@ def blueprint(
     shares = [1.0] * (len(columns) - 1) + [1.6]
     return rrb.Blueprint(
         rrb.Vertical(
-            rrb.Horizontal(*columns, column_shares=shares), _figures(), row_shares=[2.2, 1]
+            rrb.Horizontal(*columns, column_shares=shares), _figures(memory), row_shares=[2.2, 1]
         ),
         rrb.TimePanel(timeline="frame", play_state="following", state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
@@ -94,7 +99,7 @@ def _grey(limits_mm: tuple[float, float]) -> rr.DepthImage:
     return rr.DepthImage.from_fields(colormap="grayscale", depth_range=dim_range)
 
 
-def _figures() -> rrb.Horizontal:
+def _figures(memory: bool) -> rrb.Horizontal:
     """The lower row: what is seen above, and how the run fares."""
 
     def plot(name: str, *figures: str) -> rrb.TimeSeriesView:
@@ -103,6 +108,7 @@ def _figures() -> rrb.Horizontal:
             origin="/figures", contents=contents, name=name, plot_legend=rrb.Corner2D.LeftTop
         )
 
+    errors = ("rmse_mm", "truth_rmse_mm", "sensor_rmse_mm")
     return rrb.Horizontal(
         rrb.TextDocumentView(origin="/guide", name="How to read it"),
         rrb.Spatial2DView(origin="/legend", name="Colours", background=legend.BACKGROUND),
@@ -112,8 +118,9 @@ def _figures() -> rrb.Horizontal:
             rrb.StateTimelineView(origin="/sensor/state", name="Sensor"),
             row_shares=[2, 1],
         ),
-        plot("Errors in mm", "quantisation_error_mm", "rmse_mm"),
-        column_shares=[1.15, 1.15, 1, 0.9, 0.9],
+        plot("Errors in mm", "quantisation_error_mm", *errors),
+        *([plot("Pixels, %", "measured", "known")] if memory else []),
+        column_shares=[1.15, 1.15, 1, 0.9, 0.9, *([0.9] if memory else [])],
     )
 
 

@@ -15,6 +15,7 @@ from selective_depth.app.pipeline import STAGES, FrameResult
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.blueprint import blueprint, epoch_blueprint
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.selectors.memory import TemporalStep
 from selective_depth.selectors.neural_gas import RegionSelection
 
 DEPTH_COLOURS = legend.palette(legend.DEPTH_COLOURMAP)
@@ -52,6 +53,8 @@ class StepLogger:
         self._log_gas(step.regions)
         self._log_improvement(step)
         self._log_acquisition(step)
+        if step.memory is not None:
+            self._log_memory(step.memory)
         self._log_figures(step)
 
     def log_trainings(
@@ -88,6 +91,7 @@ class StepLogger:
         layout = blueprint(
             by=None if step.acquisition is None else step.acquisition.by,
             detail=options.detail,
+            memory=step.memory is not None,
             look_at_m=_middle_m(step.frame.depth_mm),
             limits_mm=self._limits_mm,
         )
@@ -130,6 +134,8 @@ class StepLogger:
         # A class means what the nearest context above says: one for all, one for the regions.
         log("camera", rr.AnnotationContext([nothing, hole]), static=True)
         log("camera/gas", rr.AnnotationContext([nothing, kept, long]), static=True)
+        forgotten = (1, "forgotten in this frame", legend.FORGOTTEN)
+        log("camera/memory", rr.AnnotationContext([nothing, forgotten]), static=True)
 
     def _log_sensor(self, step: FrameResult) -> None:
         log, depth_mm, seeds = self._stream.log, step.frame.depth_mm, step.seeds
@@ -194,6 +200,16 @@ class StepLogger:
             error_mm = step.model.error_mm
             known = ~np.isnan(error_mm)
             log("camera/error", _map_image(error_mm, legend.ERROR, known))
+
+    def _log_memory(self, memory: TemporalStep) -> None:
+        """Age of what is known, fresh bright, and what was forgotten in this frame."""
+        level = np.where(memory.known, 255 - np.minimum(8 * memory.age_frames, 200), 0)
+        image = rr.DepthImage(
+            level.astype(np.uint8), colormap=legend.AGE_COLOURMAP, depth_range=[0.0, 255.0]
+        )
+        self._stream.log("camera/memory/age", image)
+        changed = np.zeros_like(memory.changed) if memory.restarted else memory.changed
+        self._stream.log("camera/memory/changed", rr.SegmentationImage(changed.view(np.uint8)))
 
     def _log_figures(self, step: FrameResult) -> None:
         log = self._stream.log

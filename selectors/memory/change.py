@@ -23,9 +23,9 @@ MARGIN_PX = 7
 error doubles within 40 frames."""
 
 BLOCKS = (6, 8)
-"""Rows and columns of blocks in which a moved camera is looked for."""
+"""Rows and columns of blocks in which a moved camera is looked for: fewer if look-outs are few."""
 BLOCK_LOOKS = 8
-"""Of a block with fewer look-outs nothing is said."""
+"""Of a block with fewer look-outs that returned nothing is said."""
 MOVED = 2.2
 """If half of the blocks are off by so many standard errors, it is the camera that moved, or another
 scene. Of a still scene half are off by .9 to 1.4 (neighbours share a part of their error), with a
@@ -85,10 +85,12 @@ def drift(
         Standard deviation of each.
     """
     height, width = model_mm.shape
-    block = uv[:, 1] * BLOCKS[0] // height * BLOCKS[1] + uv[:, 0] * BLOCKS[1] // width
+    each = (len(uv) / (2 * BLOCK_LOOKS * BLOCKS[0] * BLOCKS[1])) ** 0.5
+    rows, columns = (max(min(int(each * count), count), 1) for count in BLOCKS)
+    block = uv[:, 1] * rows // height * columns + uv[:, 0] * columns // width
     returned = depth_mm > 0
     off = np.clip((depth_mm - model_mm[uv[:, 1], uv[:, 0]]) / noise_mm, -3, 3)
-    size = BLOCKS[0] * BLOCKS[1]
+    size = rows * columns
     looks = np.bincount(block[returned], minlength=size)
     total = np.bincount(block[returned], off[returned], minlength=size)
     judged = looks >= BLOCK_LOOKS

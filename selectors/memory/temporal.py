@@ -8,12 +8,13 @@ known that was not asked for.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import maximum_filter
 
+from selective_depth.drivers.frame import Camera
 from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.choice import choose
 from selective_depth.selectors.memory.change import (
@@ -60,8 +61,14 @@ class TemporalStep:
         Pixels measured in it, column first, each once.
     depth_mm : float32 array of shape (n,)
         Their depth; 0 = no return.
+    batch : uint8 array of shape (n,)
+        In which order: 0 = look-outs, or the seeds of a first frame.
     model_mm : float32 array of shape (H, W)
         Dense depth of all that is known.
+    known_mm : float32 array of shape (H, W)
+        What each known pixel has been fused to; 0 where not known.
+    seeds : SeedGrid
+        The lattice as it is known, for the selectors that think in its cells.
     known : bool array of shape (H, W)
         Pixels that have been measured, in this frame or before, and not been forgotten.
     age_frames : int32 array of shape (H, W)
@@ -79,7 +86,10 @@ class TemporalStep:
     frame: int
     uv: npt.NDArray[np.int32]
     depth_mm: npt.NDArray[np.float32]
+    batch: npt.NDArray[np.uint8]
     model_mm: npt.NDArray[np.float32]
+    known_mm: npt.NDArray[np.float32]
+    seeds: SeedGrid
     known: npt.NDArray[np.bool_]
     age_frames: npt.NDArray[np.int32]
     changed: npt.NDArray[np.bool_]
@@ -142,6 +152,8 @@ class TemporalAcquisition:
         By default that worth decides between new and known ones alike.
     noise : Noise, optional
         Of the sensor; default a Kinect's.
+    camera : Camera, optional
+        Intrinsics; by default a pinhole with a Kinect's field of view is assumed.
     threads : int, optional
         Kernel threads; default `default_threads()`. The result does not depend on it.
 
@@ -171,6 +183,7 @@ class TemporalAcquisition:
         rounds: int = 4,
         selector: Selector | Worth | None = None,
         noise: Noise | None = None,
+        camera: Camera | None = None,
         threads: int | None = None,
     ) -> None:
         self.shape = shape
@@ -180,9 +193,8 @@ class TemporalAcquisition:
         self._selector = selector
         self._noise = noise or Noise()
         self._threads = threads
-        nothing = SeedGrid.from_array(np.zeros(shape, np.uint16), seeds)
-        self._seeds_shape = seeds
-        lattice = nothing.lattice_uv.reshape(-1, 2)
+        self._grid = SeedGrid.from_array(np.zeros(shape, np.uint16), seeds, camera=camera)
+        lattice = self._grid.lattice_uv.reshape(-1, 2)
         # In an order of which every part is spread over the frame.
         self._lattice_uv = lattice[np.random.default_rng(0).permutation(len(lattice))]
         self._looked = 0
@@ -242,7 +254,13 @@ class TemporalAcquisition:
             frame=self._frame,
             uv=np.concatenate(sensor.uv),
             depth_mm=np.concatenate(sensor.depth_mm),
+            batch=np.repeat(
+                np.minimum(np.arange(len(sensor.uv)), 255).astype(np.uint8),
+                [len(uv) for uv in sensor.uv],
+            ),
             model_mm=model_mm,
+            known_mm=self._memory.fused_mm.copy(),
+            seeds=self._seeds(),
             known=known,
             age_frames=np.where(known, self._frame - self._memory.asked, -1).astype(np.int32),
             changed=changed,
@@ -250,6 +268,11 @@ class TemporalAcquisition:
             settled=settled,
             by=self._by,
         )
+
+    def _seeds(self) -> SeedGrid:
+        """The lattice as it is known."""
+        at = np.ix_(self._grid.rows, self._grid.columns)
+        return replace(self._grid, depth_mm=self._memory.fused_mm[at])
 
     def _look_out(self, sensor: _Sensor, changed: npt.NDArray[np.bool_]) -> bool:
         """Look whether all is as it was, and fill in where not; False if nothing is."""
@@ -291,7 +314,7 @@ class TemporalAcquisition:
 
     def _start(self, sensor: _Sensor) -> npt.NDArray[np.float32]:
         """Acquire the frame as if it were the first, and return the model of it alone."""
-        seeds = SeedGrid.measured(sensor, self.shape, self._seeds_shape)
+        seeds = SeedGrid.measured(sensor, self.shape, self._grid.shape, camera=self._grid.camera)
         spent = len(self._lattice_uv)
         shots = max(self._first_shots, self._shots - spent)
         acquisition = acquire(
