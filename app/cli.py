@@ -168,10 +168,7 @@ def check(
     (f"{PROGRAM} export virtual:ball ball.oni --frames 90", "of any source"),
 )
 def export(
-    source: Source,
-    out: Annotated[Path, arg(metavar="OUT")],
-    /,
-    frames: Limit = None,
+    source: Source, out: Annotated[Path, arg(metavar="OUT")], /, frames: Limit = None
 ) -> int:
     """Save the frames of a source as PNG files, or as an .oni file; needs no OpenNI2.
 
@@ -251,10 +248,7 @@ def screenshot(
 @command(
     "Pictures",
     (f"{PROGRAM} snapshot walk.oni --frame 30", "one frame, all panels, no viewer needed"),
-    (
-        f"{PROGRAM} snapshot virtual:workstation virtual:ball virtual:firehose",
-        "the paper's Fig. 5",
-    ),
+    (f"{PROGRAM} snapshot virtual:workstation virtual:ball virtual:firehose", "the paper's Fig. 5"),
     (f"{PROGRAM} snapshot frames/ --budget 0.05 --out pictures", "with what was acquired"),
 )
 def snapshot(
@@ -325,10 +319,7 @@ def epochs(
     return draw_epochs(source, out, save=save, number=frame, seed=seed, page=page)
 
 
-@command(
-    "Pictures",
-    (f"{PROGRAM} densities bunny.ply", "the paper's Fig. 2, to densities.png"),
-)
+@command("Pictures", (f"{PROGRAM} densities bunny.ply", "the paper's Fig. 2, to densities.png"))
 def densities(
     source: Source,
     /,
@@ -403,10 +394,7 @@ def figure(
     return draw_figure(number, sources or SCENES, out, frame, settings, page)
 
 
-@command(
-    "Pictures",
-    (f"{PROGRAM} table 1", "computing times on the three scenes, as in the paper"),
-)
+@command("Pictures", (f"{PROGRAM} table 1", "computing times on the three scenes, as in the paper"))
 def table(
     number: Annotated[Literal[1], arg(metavar="1")] = 1,
     sources: Annotated[tuple[str, ...], optional("SOURCE...")] = (),

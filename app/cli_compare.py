@@ -40,10 +40,7 @@ PAGE, FILES, COMPARED, DEFAULTS = (
     (f"{PROGRAM} nodes frames/ --every 60 --out nodes.md", "mean over every 60th frame"),
 )
 def nodes(
-    source: Source,
-    /,
-    every: Limit = None,
-    out: Annotated[Path | None, optional("FILE.md")] = None,
+    source: Source, /, every: Limit = None, out: Annotated[Path | None, optional("FILE.md")] = None
 ) -> int:
     """Tabulate neural gas over numbers of nodes and of epochs; takes minutes.
 

@@ -123,11 +123,7 @@ def best_pixels(
 
 
 def choose(
-    score: npt.ArrayLike,
-    shots: int,
-    *,
-    crowded: float = CROWDED,
-    threads: int | None = None,
+    score: npt.ArrayLike, shots: int, *, crowded: float = CROWDED, threads: int | None = None
 ) -> npt.NDArray[np.int32]:
     """The pixels of a map that are worth most.
 

@@ -78,10 +78,7 @@ def object_seeds(frame: DepthFrame, points: int) -> SeedGrid:
 
 
 def epoch_selections(
-    seeds: SeedGrid,
-    epochs: Sequence[int] = EPOCHS,
-    nodes: int = FIRST_NODES,
-    seed: int = 0,
+    seeds: SeedGrid, epochs: Sequence[int] = EPOCHS, nodes: int = FIRST_NODES, seed: int = 0
 ) -> Iterator[tuple[int, dict[EdgeMetric, RegionSelection]]]:
     """Train by the published steps for several lengths; yield the regions of each as it is done.
 

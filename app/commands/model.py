@@ -49,10 +49,7 @@ def save_cloud(path: Path, acquisition: Acquisition, camera: Camera) -> int:
     """
     kept = acquisition.returned
     rounds = acquisition.round[kept]
-    vertex = np.empty(
-        int(kept.sum()),
-        [("xyz", "<f4", 3), ("rgb", "u1", 3), ("round", "u1")],
-    )
+    vertex = np.empty(int(kept.sum()), [("xyz", "<f4", 3), ("rgb", "u1", 3), ("round", "u1")])
     vertex["xyz"] = camera.points_mm(acquisition.uv[kept], acquisition.depth_mm[kept])
     vertex["round"] = rounds
     last = int(acquisition.round.max(initial=1))

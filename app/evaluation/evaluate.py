@@ -22,12 +22,7 @@ import numpy as np
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.evaluation.strategies import (
-    STRATEGIES,
-    Case,
-    strategies_of,
-    strategy_of,
-)
+from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of, strategy_of
 from selective_depth.app.settings import Settings
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import DepthFrame

@@ -13,13 +13,7 @@ from rich.table import Table
 from selective_depth.app.console.command import colours
 from selective_depth.app.console.output import check_output, check_picture, write_output
 from selective_depth.app.console.progress import FrameProgress
-from selective_depth.app.evaluation.evaluate import (
-    Outcome,
-    Results,
-    frames_of,
-    outcomes,
-    summarise,
-)
+from selective_depth.app.evaluation.evaluate import Outcome, Results, frames_of, outcomes, summarise
 from selective_depth.app.evaluation.files import check_table, curves, to_json, write_table
 from selective_depth.app.evaluation.over_time import run_over_time
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategy_of

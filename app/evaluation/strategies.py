@@ -231,8 +231,7 @@ STRATEGIES: dict[str, Strategy] = {
         "published improvement (eq. 23), one shot", lambda c: c.best(c.improvement.raw)
     ),
     "improvement_loop": Strategy(
-        "published improvement, closed loop",
-        lambda c: _selected(c, "improvement", loop=True),
+        "published improvement, closed loop", lambda c: _selected(c, "improvement", loop=True)
     ),
     "gradient": Strategy("gradient of the interpolated depth, one shot", _gradient),
     "quadtree": Strategy(

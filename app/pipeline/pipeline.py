@@ -235,10 +235,7 @@ class Pipeline:
         return done.result() if done else None
 
     def _model(
-        self,
-        frame: DepthFrame,
-        acquisition: Acquisition,
-        stages_ms: dict[str, float] | None = None,
+        self, frame: DepthFrame, acquisition: Acquisition, stages_ms: dict[str, float] | None = None
     ) -> Model:
         with self.times.stage("model", stages_ms):
             return Model.of(acquisition.reconstruct(self._threads), frame)

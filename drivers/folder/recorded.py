@@ -37,12 +37,7 @@ from selective_depth.drivers.errors import (
     SourceTimeoutError,
 )
 from selective_depth.drivers.folder.images import read_png, read_png_size
-from selective_depth.drivers.folder.sidecar import (
-    SIDECAR,
-    Sidecar,
-    read_sidecar,
-    read_text,
-)
+from selective_depth.drivers.folder.sidecar import SIDECAR, Sidecar, read_sidecar, read_text
 from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
 from selective_depth.drivers.source import DepthSource
 

@@ -40,13 +40,7 @@ from selective_depth.drivers.oni.records import (
     parse_property,
     read_record,
 )
-from selective_depth.drivers.oni.report import (
-    STREAMS,
-    OniFrame,
-    OniNode,
-    OniProblem,
-    OniReport,
-)
+from selective_depth.drivers.oni.report import STREAMS, OniFrame, OniNode, OniProblem, OniReport
 
 _MAX_NODES: Final = 64
 _MILLIMETRES: Final = 100

@@ -110,10 +110,7 @@ def choose(found: list[dict[str, Any]], wanted: str, like: dict[str, Any] | None
         wanted = ""
     uris = ", ".join(device["uri"] for device in found) or "none"
     if wanted:
-        raise JobError(
-            "SourceNotFoundError",
-            f"There is no sensor '{wanted}'. Connected: {uris}.",
-        )
+        raise JobError("SourceNotFoundError", f"There is no sensor '{wanted}'. Connected: {uris}.")
     if not found:
         raise JobError(
             "SourceNotFoundError",
@@ -420,11 +417,7 @@ def run_record(job: dict[str, Any], parent: Parent) -> None:
     live.close()
 
 
-JOBS = {
-    "list": run_list,
-    "device": run_device,
-    "record": run_record,
-}
+JOBS = {"list": run_list, "device": run_device, "record": run_record}
 
 
 def main() -> None:

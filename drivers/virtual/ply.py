@@ -238,10 +238,7 @@ def _walk(data: bytes, at: int, order: str, element: _Element, rows: int) -> tup
 
 
 def _gather(
-    data: bytes,
-    begins: npt.NDArray[np.int64],
-    lengths: npt.NDArray[np.int64] | None,
-    code: str,
+    data: bytes, begins: npt.NDArray[np.int64], lengths: npt.NDArray[np.int64] | None, code: str
 ) -> npt.NDArray[np.float64]:
     """The numbers that begin at these bytes: runs of these lengths (default: 1), end to end."""
     kind = np.dtype(code)

@@ -39,10 +39,7 @@ def draw_nodes(
 
 
 def train_exact(
-    points_mm: npt.NDArray[np.float32],
-    nodes: int,
-    epochs: int,
-    seed: int,
+    points_mm: npt.NDArray[np.float32], nodes: int, epochs: int, seed: int
 ) -> npt.NDArray[np.float32]:
     """Train neural gas from nothing with the published steps.
 

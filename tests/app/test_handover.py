@@ -142,9 +142,7 @@ def test_what_a_sink_left_behind_had_in_hand_and_before_it_is_dropped() -> None:
     gate.opened.set()
 
 
-def test_a_sink_that_does_not_open_is_waited_for_no_longer(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_sink_that_does_not_open_is_waited_for_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse() -> None:
         raise OSError("no viewer")
 

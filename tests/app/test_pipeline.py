@@ -43,9 +43,7 @@ from selective_depth.selectors.acquire import Acquisition
 
 HEIGHT, WIDTH = 48, 64
 SMALL = Settings(
-    seeds=SeedOptions(24, 32),
-    gas=GasOptions(nodes=60),
-    viewer=ViewerOptions(headless=True),
+    seeds=SeedOptions(24, 32), gas=GasOptions(nodes=60), viewer=ViewerOptions(headless=True)
 )
 
 
@@ -367,9 +365,7 @@ def test_realtime_passes_faults_on_and_bounds_its_wait() -> None:
         release.set()
 
 
-def test_realtime_passes_on_what_no_source_should_raise(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_realtime_passes_on_what_no_source_should_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     script = Script([0])
 
     def read(timeout_s: float = 5.0) -> DepthFrame:
@@ -381,9 +377,7 @@ def test_realtime_passes_on_what_no_source_should_raise(
     assert script.closed == 1
 
 
-def test_realtime_waits_for_a_reader_that_had_to_ask_often(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_realtime_waits_for_a_reader_that_had_to_ask_often(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reads that timed out before the first frame do not start the clock."""
     script = Script(list(range(12)))
     release, plain = threading.Event(), script.read

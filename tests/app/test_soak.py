@@ -20,12 +20,7 @@ from virtual_sensor import VirtualSensor
 
 from selective_depth.app.commands import run as session_module
 from selective_depth.app.commands.run import Session
-from selective_depth.app.settings import (
-    AcquireOptions,
-    RunOptions,
-    Settings,
-    ViewerOptions,
-)
+from selective_depth.app.settings import AcquireOptions, RunOptions, Settings, ViewerOptions
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.oni import write_oni
 from selective_depth.drivers.open import open_source
@@ -132,10 +127,7 @@ def test_a_sensor_can_be_watched_for_long(
 @pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
 @pytest.mark.parametrize("count", LENGTHS)
 def test_a_long_recording_can_be_replayed(
-    count: int,
-    desk_mm: npt.NDArray[np.uint16],
-    virtual_driver: Path,
-    tmp_path: Path,
+    count: int, desk_mm: npt.NDArray[np.uint16], virtual_driver: Path, tmp_path: Path
 ) -> None:
     camera = Camera.kinect()
     frames = (

@@ -90,10 +90,7 @@ def test_the_table_holds_what_is_provoked_here() -> None:
     ],
 )
 def test_it_says_so(
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     code = cli.run(PROVOKED[message](tmp_path, monkeypatch))
     said = capfd.readouterr()

@@ -14,14 +14,7 @@ from selective_depth.selectors.even import EvenSelector
 from selective_depth.selectors.improvement import ImprovementSelector
 from selective_depth.selectors.memory import TemporalAcquisition
 from selective_depth.selectors.memory.change import Extent, around, contradicts, drift
-from selective_depth.selectors.memory.store import (
-    AGREE_MM,
-    AGREE_SHARE,
-    KEPT,
-    Memory,
-    book,
-    forget,
-)
+from selective_depth.selectors.memory.store import AGREE_MM, AGREE_SHARE, KEPT, Memory, book, forget
 from selective_depth.selectors.memory.temporal import PROBATION
 from selective_depth.selectors.memory.worth import WRONG, shot_worth
 from selective_depth.selectors.neural_gas import LongEdgeSelector, NeuralGasSelector

@@ -111,10 +111,7 @@ class VirtualSensor:
     @property
     def env(self) -> dict[str, str]:
         """What a process needs in its environment to see this sensor."""
-        return {
-            "OPENNI2_REDIST": str(self.runtime),
-            "VIRTUAL_SENSOR_CONTROL": str(self._control),
-        }
+        return {"OPENNI2_REDIST": str(self.runtime), "VIRTUAL_SENSOR_CONTROL": str(self._control)}
 
     def set(self, **keys: int | Path) -> None:
         """Change the sensor, now; it takes effect within a few milliseconds."""

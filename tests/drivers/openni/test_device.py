@@ -158,9 +158,7 @@ def test_a_stall_is_shown_and_passes(virtual_sensor: VirtualSensor) -> None:
     disturb(virtual_sensor, "stalled", stall=1)
 
 
-def test_a_pulled_plug_is_noticed_and_the_sensor_taken_back(
-    virtual_sensor: VirtualSensor,
-) -> None:
+def test_a_pulled_plug_is_noticed_and_the_sensor_taken_back(virtual_sensor: VirtualSensor) -> None:
     disturb(virtual_sensor, "lost", connected=0)
 
 

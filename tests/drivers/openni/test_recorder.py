@@ -97,11 +97,7 @@ def test_so_long_as_asked(virtual_sensor: VirtualSensor, tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("fault", "ended"),
-    [
-        ({"connected": 0}, "unplugged"),
-        ({"stall": 1}, "sent nothing"),
-        ({"crash": 1}, "SIGSEGV"),
-    ],
+    [({"connected": 0}, "unplugged"), ({"stall": 1}, "sent nothing"), ({"crash": 1}, "SIGSEGV")],
 )
 def test_a_fault_of_the_sensor_ends_it_with_what_is_there(
     virtual_sensor: VirtualSensor,
