@@ -18,15 +18,12 @@ CROWDED = 0.3
 With 1 shots clump; with 0 (3x3 maxima first, whatever they are worth) they are wasted on maxima
 of nothing as soon as the good ones are gone. Between .2 and .7 it hardly matters."""
 
-_TILE_PX = 16
 _SAMPLED = 31  # shares no factor with the usual widths of images
 
 
 @njit(cache=True, nogil=True)
 def _gather(
     score: npt.NDArray[np.float32],
-    tiles: npt.NDArray[np.int64],
-    tile_px: int,
     least: float,
     crowded: float,
     pixel: npt.NDArray[np.int64],
@@ -34,92 +31,54 @@ def _gather(
     first: int,
     end: int,
 ) -> int:
-    """Pixels of the tiles first..end worth at least `least`, written from first's place on."""
+    """Pixels of the rows first..end worth at least `least`, written from first's place on."""
     height, width = score.shape
-    tile_columns = (width + tile_px - 1) // tile_px
-    at = first * tile_px * tile_px
-    for k in range(first, end):
-        top, left = tiles[k] // tile_columns * tile_px, tiles[k] % tile_columns * tile_px
-        for v in range(top, min(top + tile_px, height)):
-            for u in range(left, min(left + tile_px, width)):
-                s = score[v, u]
-                if s <= 0 or s < least:
+    at = first * width
+    for v in range(first, end):
+        for u in range(width):
+            s = score[v, u]
+            if s <= 0 or s < least:
+                continue
+            better = False
+            for y in range(max(v - 1, 0), min(v + 2, height)):
+                for x in range(max(u - 1, 0), min(u + 2, width)):
+                    better |= score[y, x] > s
+            if better:
+                s *= np.float32(crowded)
+                if s < least:
                     continue
-                better = False
-                for y in range(max(v - 1, 0), min(v + 2, height)):
-                    for x in range(max(u - 1, 0), min(u + 2, width)):
-                        better |= score[y, x] > s
-                if better:
-                    s *= np.float32(crowded)
-                    if s < least:
-                        continue
-                pixel[at] = v * width + u
-                worth[at] = s
-                at += 1
-    return at - first * tile_px * tile_px
+            pixel[at], worth[at] = v * width + u, s
+            at += 1
+    count: int = at - first * width
+    return count
 
 
-def best_pixels(
-    score: npt.NDArray[np.float32],
-    tiles: npt.NDArray[np.int64],
-    shots: int,
-    least: float,
-    tile_px: int,
-    threads: int | None = None,
-    crowded: float = CROWDED,
-) -> tuple[npt.NDArray[np.int32], np.float32]:
-    """The pixels of some tiles that are worth most, and what the last of them is worth.
-
-    Parameters
-    ----------
-    score : float32 array of shape (H, W)
-        Worth of a shot at each pixel; those with 0 are never chosen.
-    tiles : int array
-        Tiles to choose from, numbered row by row.
-    shots : int
-        How many pixels at most.
-    least : float
-        Pixels worth less are left out.
-    tile_px : int
-        Side of the tiles.
-    threads : int, optional
-        Kernel threads.
-    crowded : float, default `CROWDED`
-        Factor on pixels with a better one among their eight neighbours.
-
-    Returns
-    -------
-    uv : int32 array of shape (n, 2)
-        Column first, row by row of the image; n <= shots.
-    worst : float32
-        Worth of the last one chosen, 0 if there is none.
-    """
-    room = len(tiles) * tile_px * tile_px
-    pixel, worth = np.empty(room, np.int64), np.empty(room, np.float32)
+def _best(
+    score: npt.NDArray[np.float32], shots: int, least: float, crowded: float, threads: int | None
+) -> npt.NDArray[np.int32]:
+    """The pixels worth most, and `least` at the least, row by row of the image."""
+    width = score.shape[1]
+    pixel, worth = np.empty(score.size, np.int64), np.empty(score.size, np.float32)
     parts: list[tuple[int, int]] = []
 
     def band(first: int, end: int) -> None:
-        count = _gather(score, tiles, tile_px, least, crowded, pixel, worth, first, end)
-        parts.append((first * tile_px * tile_px, count))
+        count = _gather(score, least, crowded, pixel, worth, first, end)
+        parts.append((first * width, count))
 
-    if shots > 0 and len(tiles):
-        in_bands(band, len(tiles), threads)
+    if shots > 0:
+        in_bands(band, len(score), threads)
     runs = [slice(start, start + count) for start, count in sorted(parts)]
-    pixel = np.concatenate([pixel[run] for run in runs]) if runs else pixel[:0]
-    worth = np.concatenate([worth[run] for run in runs]) if runs else worth[:0]
+    pixel = np.concatenate([pixel[:0], *(pixel[run] for run in runs)])
+    worth = np.concatenate([worth[:0], *(worth[run] for run in runs)])
     if len(pixel) > shots:
-        worst = np.partition(worth, len(worth) - shots)[-shots]
-        sure = worth > worst
-        ties = np.flatnonzero(worth == worst)
+        last = np.partition(worth, len(worth) - shots)[-shots]
+        sure = worth > last
+        ties = np.flatnonzero(worth == last)
         # Of equals, take some from everywhere rather than the topmost.
         scatter = (pixel[ties] * 2654435761) & 0xFFFFFFFF
         sure[ties[np.argsort(scatter)[: shots - np.count_nonzero(sure)]]] = True
-        pixel, worth = pixel[sure], worth[sure]
-    else:
-        worst = worth.min() if len(worth) else np.float32(0)
-    pixel.sort()
-    width = score.shape[1]
-    return np.stack((pixel % width, pixel // width), axis=-1).astype(np.int32), worst
+        pixel = pixel[sure]
+    return np.stack((pixel % width, pixel // width), axis=-1).astype(np.int32)
 
 
 def choose(
@@ -159,13 +118,11 @@ def choose(
     if shots < 0:
         raise ValueError(f"shots is {shots}; give 0 or more")
     worth = checked_map(score, np.shape(score), "score")
-    count = -(-worth.shape[0] // _TILE_PX) * -(-worth.shape[1] // _TILE_PX)
-    tiles = np.arange(count)
     # Most pixels are out of the question: a sample of them says where to draw a safe line.
     some = worth.ravel()[::_SAMPLED]
     rank = 4 * shots // _SAMPLED
     least = float(np.partition(some, len(some) - rank)[-rank]) if 0 < rank < len(some) else 0.0
-    uv, _ = best_pixels(worth, tiles, shots, least, _TILE_PX, threads, crowded)
+    uv = _best(worth, shots, least, crowded, threads)
     if len(uv) < shots and least > 0:
-        uv, _ = best_pixels(worth, tiles, shots, 0.0, _TILE_PX, threads, crowded)
+        uv = _best(worth, shots, 0.0, crowded, threads)
     return uv

@@ -30,29 +30,11 @@ def _record(
     depth_mm: npt.NDArray[np.float32],
     image_mm: npt.NDArray[np.float32],
     bits: npt.NDArray[np.uint64],
-    low_mm: npt.NDArray[np.float32],
-    high_mm: npt.NDArray[np.float32],
-    changed: npt.NDArray[np.int64],
-    number: int,
-    tile_px: int,
 ) -> None:
-    tile_rows, tile_columns = changed.shape
-    touched = np.zeros(changed.shape, np.bool_)
     for i in range(len(uv)):
-        u, v, z = uv[i, 0], uv[i, 1], depth_mm[i]
+        u, v = uv[i, 0], uv[i, 1]
         bits[v, (u >> 6) + 1] |= np.uint64(1) << np.uint64(u & 63)
-        row, column = v // tile_px, u // tile_px
-        if z > 0:
-            image_mm[v, u] = z
-            low_mm[row, column] = min(low_mm[row, column], z)
-            high_mm[row, column] = max(high_mm[row, column], z)
-        else:
-            image_mm[v, u] = MISSED
-        touched[row, column] = True
-    for row in range(tile_rows):
-        for column in range(tile_columns):
-            if touched[row, column]:
-                changed[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = number
+        image_mm[v, u] = depth_mm[i] if depth_mm[i] > 0 else MISSED
 
 
 def seed_pitch_px(seeds: SeedGrid) -> float:
@@ -81,21 +63,15 @@ class Samples:
         mostly hit a hole (6.5 pixels for 128x128 seeds).
     vote_px : int
         1.8 steps, at most 21: samples farther than this from a pixel have no say about it. (So
-        much, on both sides of a tile, fits in one word of `bits`.)
-    tile_px : int
-        Side of the square tiles in which changes and depth ranges are booked: `vote_px`, rounded
-        up to whole blocks of 3x3 pixels. So a measurement matters to its own and the eight tiles
-        around it only.
+        much, on both sides, fits in one word of `bits`.)
     image_mm : float32 array of shape (H, W)
         Depth where a measurement returned, `MISSED` where one did not, 0 where none was made.
     bits : uint64 array of shape (H, words)
         One bit per measured pixel; a word of zeros on either side spares the borders.
-    low_mm, high_mm : float32 arrays of shape (rows, columns)
-        Least and greatest depth in each tile; low > high where there is none.
     additions : int
         How often measurements were added.
-    changed : int64 array of shape (rows, columns)
-        Number of the last addition to each tile or to one beside it, 0 before the first.
+    nearest_mm : float
+        Least depth that returned; infinite before the first.
     """
 
     def __init__(
@@ -106,15 +82,11 @@ class Samples:
         self._seeds = seeds
         self.vote_px = min(math.ceil(1.8 * pitch_px), (_WORD - 1) // 3)
         self.reach_px = min(REACH * pitch_px, self.vote_px)
-        self.tile_px = 3 * math.ceil(self.vote_px / 3)
-        tiles = -(-height // self.tile_px), -(-width // self.tile_px)
         self.image_mm = np.zeros(frame_shape, np.float32)
         self.bits = np.zeros((height, (width + _WORD - 1) // _WORD + 2), np.uint64)
-        self.low_mm = np.full(tiles, np.inf, np.float32)
-        self.high_mm = np.zeros(tiles, np.float32)
         self.additions = 0
+        self.nearest_mm = math.inf
         self._added: list[tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]] = []
-        self.changed = np.zeros(tiles, np.int64)
 
     @classmethod
     def of(cls, seeds: SeedGrid | Samples, pitch_px: float | None = None) -> Samples:
@@ -146,11 +118,9 @@ class Samples:
         """
         pixels, mm = sample_pairs(uv, depth_mm, self.frame_shape)
         self.additions += 1
+        self.nearest_mm = min(self.nearest_mm, float(mm[mm > 0].min(initial=np.inf)))
         self._added.append((pixels, mm))
-        _record(
-            pixels, mm, self.image_mm, self.bits, self.low_mm, self.high_mm, self.changed,
-            self.additions, self.tile_px,
-        )  # fmt: skip
+        _record(pixels, mm, self.image_mm, self.bits)
 
     def added_since(
         self, addition: int

@@ -207,11 +207,11 @@ def _print(uri: str, ways: dict[str, Course], budget: float) -> None:
         box=None,
         padding=(0, 0, 0, 2),
     )
-    shown.add_column("RMSE / MAE, mm, at frame")
-    at = sorted({0, *(n - 1 for n in (5, 10, 20, 30) if n < count), count - 1})
+    shown.add_column("RMSE / MAE, mm", no_wrap=True)
+    at = sorted({0, *(n - 1 for n in (10, 20) if n < count), count - 1})
     for index in at:
-        shown.add_column(str(index), justify="right")
-    shown.add_column("mean", justify="right")
+        shown.add_column(f"frame {index}", justify="right", no_wrap=True)
+    shown.add_column("mean", justify="right", no_wrap=True)
     for way, course in ways.items():
         cells = [f"{course.rmse_mm[i]:.1f} / {course.mae_mm[i]:.1f}" for i in at]
         mean = f"{np.nanmean(course.rmse_mm):.1f} / {np.nanmean(course.mae_mm):.1f}"

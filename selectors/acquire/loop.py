@@ -231,7 +231,7 @@ def _allowed(uv: npt.ArrayLike, samples: Samples, left: int) -> npt.NDArray[np.i
 
 def _refuse_metres(new_mm: npt.NDArray[np.float32], samples: Samples) -> None:
     """A sensor that answers a hundredth of all that was measured so far means something else."""
-    farthest, nearest = float(new_mm.max(initial=0)), float(samples.low_mm.min())
+    farthest, nearest = float(new_mm.max(initial=0)), samples.nearest_mm
     if 0 < farthest < nearest / 100 < np.inf:
         raise ValueError(
             f"the sensor answers {farthest:g} mm at most, but nothing nearer than {nearest:g} mm"

@@ -11,42 +11,16 @@ share of the neighbours that did.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
-from selective_depth.selectors.acquire.step_kernel import (
-    SLOTS,
-    Image,
-    SampleIndex,
-    StepRule,
-    clear_tiles,
-    score_tiles,
-    tile_bounds,
-)
-from selective_depth.selectors.choice import best_pixels
+from selective_depth.selectors.acquire.step_kernel import StepRule, score_rows
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
-from selective_depth.selectors.selection import Plan, Selection
+from selective_depth.selectors.selection import Selection
 
-_SAMPLED = 16
-"""One tile in so many is scored first, to see where the line will be drawn."""
-
-_MARGIN = 1.3
-"""The line is drawn for so many times the pixels wanted: a second pass costs more."""
-
-_BANDS = 8
-"""Tiles are dealt out in so many hands: what is dear lies side by side in the image."""
-
-
-@lru_cache(maxsize=8)
-def _tables(falloff: float, vote_px: int) -> tuple[Image, Image, npt.NDArray[np.int64]]:
-    """Weight, length and whole root of every squared distance up to that of a block's voters."""
-    length = np.sqrt(np.arange(int((vote_px + 2**0.5) ** 2) + 1))
-    weight = 1 / (length**falloff + 1)
-    return weight.astype(np.float32), length.astype(np.float32), length.astype(np.int64)
+MOST_VOTERS = 6
 
 
 @dataclass(frozen=True)
@@ -90,100 +64,25 @@ class StepSelector:
     name = "step score"
 
     def __post_init__(self) -> None:
-        if not 2 <= self.voters <= SLOTS:  # the gap is told by two
-            raise ValueError(f"voters is {self.voters}; give between 2 and {SLOTS}")
+        if not 2 <= self.voters <= MOST_VOTERS:  # the gap is told by two
+            raise ValueError(f"voters is {self.voters}; give between 2 and {MOST_VOTERS}")
 
     def select(self, samples: SeedGrid | Samples) -> Selection:
         """Score every pixel, in mm^2 times pixels; the mask is the best tenth of them."""
         known = Samples.of(samples)
+        distance_px = np.sqrt(np.arange(known.vote_px**2 + 1))
+        rule = StepRule(
+            weight_of=(1 / (distance_px**self.falloff + 1)).astype(np.float32),
+            vote_px=known.vote_px,
+            reach_px=known.reach_px,
+            voters=self.voters,
+            gap_px=self.gap * known.pitch_px,
+            noise_mm2=self.noise_mm**2,
+        )
         score = np.empty(known.frame_shape, np.float32)
-        most = np.empty(known.changed.shape, np.float32)
-        self._score(known, np.arange(known.changed.size), 0.0, score, most)
+
+        def band(first: int, end: int) -> None:
+            score_rows(first, end, known.image_mm, known.bits, rule, score)
+
+        in_bands(band, len(score), self.threads)
         return Selection.of_score(score, self.name)
-
-    def plan(self, samples: Samples) -> Plan:
-        """Begin an acquisition; same choice as by the whole map, at a fraction of the work."""
-        return _StepPlan(self, samples)
-
-    def _score(
-        self,
-        samples: Samples,
-        tiles: npt.NDArray[np.int64],
-        least: float,
-        score: Image,
-        most: Image,
-    ) -> None:
-        index = SampleIndex(
-            samples.image_mm, samples.bits, samples.tile_px, samples.vote_px, samples.reach_px
-        )
-        tables = _tables(self.falloff, samples.vote_px)
-        rule = StepRule(*tables, self.voters, self.gap * samples.pitch_px, self.noise_mm**2)
-        dealt = np.concatenate([tiles[hand::_BANDS] for hand in range(_BANDS)])
-        in_bands(
-            lambda first, end: score_tiles(first, end, dealt, index, rule, least, score, most),
-            len(dealt),
-            self.threads,
-        )
-
-    def _bounds(self, samples: Samples) -> Image:
-        gap_px = self.gap * samples.pitch_px
-        return tile_bounds(samples.low_mm, samples.high_mm, gap_px, self.noise_mm**2)
-
-
-class _StepPlan(Plan):
-    """Scores only what has changed and can be among the best pixels.
-
-    The range of the depths around a tile bounds its scores, and so it does in a tile, block by
-    block. A sample of the tiles tells about where the line will be drawn; what is bounded below
-    it cannot matter if enough pixels reach it, and if not, it is lowered. The pixels chosen are
-    those that the whole map would give.
-    """
-
-    def __init__(self, rule: StepSelector, samples: Samples) -> None:
-        self._rule = rule
-        self._samples = samples
-        self._map = np.zeros(samples.frame_shape, np.float32)
-        tiles = samples.changed.shape
-        self._most = np.zeros(tiles, np.float32)  # best score in each tile
-        # Scores of a tile are true from this one on; lower ones may be missing.
-        self._floor = np.full(tiles, np.inf, np.float32)
-        self._seen = samples.additions
-
-    def best(self, shots: int) -> npt.NDArray[np.int32]:
-        """The `shots` pixels that are worth most, from the samples as they are now."""
-        samples = self._samples
-        outdated = (samples.changed > self._seen) & (self._floor < np.inf)
-        clear_tiles(self._map, np.flatnonzero(outdated), samples.tile_px)
-        self._floor[outdated] = np.inf
-        self._most[outdated] = 0
-        self._seen = samples.additions
-        bound = self._rule._bounds(samples)
-        least = self._first_line(bound, shots)
-        while True:
-            self._score(bound >= least, least)
-            chosen = self._best(np.flatnonzero(self._most >= least), shots, least)[0]
-            if len(chosen) == shots or least <= 0:
-                return chosen
-            least = least / 4 if least > self._rule.noise_mm**2 else 0.0
-
-    def _first_line(self, bound: Image, shots: int) -> float:
-        """About what the last of the best pixels will be worth, rather less."""
-        sample = np.zeros(bound.shape, np.bool_)
-        sample.ravel()[np.argsort(bound, axis=None)[_SAMPLED // 2 :: _SAMPLED]] = True
-        self._score(sample, 0.0)
-        wanted = int(_MARGIN * shots / _SAMPLED) + 1
-        chosen, worst = self._best(np.flatnonzero(sample), wanted, 0.0)
-        return float(worst) if len(chosen) == wanted else 0.0
-
-    def _score(self, wanted: npt.NDArray[np.bool_], least: float) -> None:
-        """Make the scores of some tiles true from `least` on."""
-        due = wanted & (self._floor > least)
-        tiles = np.flatnonzero(due)
-        self._rule._score(self._samples, tiles, least, self._map, self._most)
-        self._floor[due] = least
-
-    def _best(
-        self, tiles: npt.NDArray[np.int64], shots: int, least: float
-    ) -> tuple[npt.NDArray[np.int32], np.float32]:
-        tile_px = self._samples.tile_px
-        return best_pixels(self._map, tiles, shots, least, tile_px, self._rule.threads)

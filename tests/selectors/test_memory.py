@@ -42,7 +42,7 @@ def fused_slowly(values: list[float]) -> tuple[float, int]:
     """The rule of `store`, written out: mean of what agrees with the middle one."""
     kept, before = [], 0.0
     for value in values:
-        kept = (kept + [value])[-KEPT:]
+        kept = [*kept, value][-KEPT:]
         ordered = sorted(kept)
         lower, upper = ordered[(len(kept) - 1) // 2], ordered[len(kept) // 2]
         middle = lower if abs(lower - before) <= abs(upper - before) else upper

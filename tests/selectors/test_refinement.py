@@ -11,7 +11,7 @@ from selective_depth.selectors.acquire import StepSelector, acquire
 from selective_depth.selectors.acquire.refinement import COARSE_PX, HOLE_STEPS, SHARE, finer_lattice
 from selective_depth.selectors.samples import Samples, seed_pitch_px
 from selective_depth.selectors.seeds import SeedGrid
-from selective_depth.selectors.selection import Plan
+from selective_depth.selectors.selection import Plan, plan_of
 
 
 def flat(lattice: tuple[int, int], shape: tuple[int, int] = (120, 160)) -> SeedGrid:
@@ -81,7 +81,7 @@ def test_distances_are_judged_by_the_finer_lattice() -> None:
     class Spy(StepSelector):
         def plan(self, samples: Samples) -> Plan:
             pitches_px.append(samples.pitch_px)
-            return super().plan(samples)
+            return plan_of(StepSelector(), samples)
 
     pitches_px: list[float] = []
     seeds = flat((12, 16))
