@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from selective_depth.drivers.errors import SourceNotFoundError
+from selective_depth.drivers.options import Options
 from selective_depth.drivers.source import DepthSource
 
 _WHAT_THERE_IS = (
@@ -21,7 +22,8 @@ def open_source(uri: str | Path) -> DepthSource:
     uri : str or Path
         ``openni`` or ``openni:<device uri>``, a live sensor through OpenNI2;
         ``<file>.oni``, a recording, replayed frame by frame;
-        ``<folder>``, 16-bit PNG frames (plain, TUM, 7-Scenes or Redwood layout);
+        ``<folder>``, depth images in one of two dozen layouts; ``<file>.npy`` or ``.npz``;
+        after ``?`` their ``scale`` (values per metre) and ``camera`` (fx,fy,cx,cy);
         ``virtual:<scene>``, a virtual Kinect in a made scene, with options after ``?``;
         ``<file>.ply``, an object seen from a chosen side.
 
@@ -44,23 +46,30 @@ def open_source(uri: str | Path) -> DepthSource:
         from selective_depth.drivers.virtual import VirtualSource
 
         return VirtualSource(rest)
-    path = Path(name.partition("?")[0]) if not Path(name).exists() else Path(name)
+    named, _, query = (name, "", "") if Path(name).exists() else name.partition("?")
+    path, options = Path(named), Options(query, f"'{named}'")
     suffix = path.suffix.lower()
     if suffix == ".ply":
         from selective_depth.drivers.virtual import MeshSource
 
         return MeshSource(name)
-    if path.is_dir():
+    if path.is_dir() or (suffix in (".npy", ".npz") and path.exists()):
         from selective_depth.drivers.folder import RecordedFolder
 
-        return RecordedFolder(path)
+        scale = options.numbers("scale", "values per metre", 1e-2, 1e6)
+        intrinsics = options.camera()
+        options.done()
+        return RecordedFolder(
+            path, values_per_metre=scale[0] if scale else None, intrinsics=intrinsics
+        )
     if suffix == ".oni":
         from selective_depth.drivers.oni import OniReader
 
+        options.done()
         return OniReader(path)
     if not path.exists():
-        raise SourceNotFoundError(f"'{name}' does not exist. {_WHAT_THERE_IS}")
+        raise SourceNotFoundError(f"'{named}' does not exist. {_WHAT_THERE_IS}")
     raise SourceNotFoundError(
-        f"'{name}' is no depth source: a recording ends in .oni, an object in .ply, and PNG frames"
-        " are given by their folder."
+        f"'{named}' is no depth source: a recording ends in .oni, an object in .ply, an array in"
+        " .npy or .npz, and PNG frames are given by their folder."
     )

@@ -5,9 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from selective_depth.drivers.errors import SourceNotFoundError
+from selective_depth.drivers.frame import MOST_PX
 
+ON_COMMANDS = ("scale", "camera", "mode", "topic", "stream")
+"""Options of sources that every command takes as ``--NAME VALUE``, see `appended`."""
 SMALLEST, LARGEST = 16, 4096
 """Bounds of a frame's width and height in pixels that `Options.size` accepts."""
+
+
+def appended(uri: str, given: dict[str, str]) -> str:
+    """A source's name with options after it, as `open_source` takes it."""
+    more = "&".join(f"{name}={value}" for name, value in given.items())
+    return f"{uri}{'&' if '?' in uri else '?'}{more}" if more else uri
 
 
 class Options:
@@ -106,6 +115,29 @@ class Options:
         if word not in allowed or not (number.isascii() and number.isdecimal() and len(number) < 9):
             raise self._refuse(name, value, words)
         return word, int(number)
+
+    def numbers(self, name: str, what: str, low: float, high: float) -> tuple[float, ...] | None:
+        """Numbers from `low` to `high`, as many as `what` names, commas between; None if absent."""
+        count = what.count(",") + 1
+        allowed = f"{what}, {'each ' * (count > 1)}a number from {low:g} to {high:g}"
+        value = self._take(name, allowed)
+        if value is None:
+            return None
+        try:
+            numbers = tuple(float(word) for word in value.split(","))
+        except ValueError:
+            raise self._refuse(name, value, allowed) from None
+        if len(numbers) != count or not all(low <= number <= high for number in numbers):
+            raise self._refuse(name, value, allowed)
+        return numbers
+
+    def text(self, name: str, what: str) -> str:
+        """Any text; empty if absent."""
+        return self._take(name, what) or ""
+
+    def camera(self) -> tuple[float, ...] | None:
+        """The intrinsics that were given for a source: fx, fy, cx, cy in pixels."""
+        return self.numbers("camera", "fx,fy,cx,cy", -MOST_PX, MOST_PX)
 
     def size(self, name: str, default: tuple[int, int]) -> tuple[int, int]:
         """Width and height in pixels, written ``640x480``."""

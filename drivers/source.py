@@ -34,6 +34,8 @@ class DepthSource(ABC):
     state : str
         ``"live"``; a sensor that can fail also says ``"stalled"`` (there, but silent),
         ``"lost"`` (not there) or ``"reconnecting"`` (there again, being opened).
+    about : str
+        What it is read as, in one sentence, where that is not plain; the first line of a run.
     notes : tuple of str
         What a user should know of it, a sentence each: what is missing, what was assumed.
     """
@@ -45,6 +47,7 @@ class DepthSource(ABC):
     live: bool
     dropped: int
     state: str = "live"
+    about: str = ""
     notes: tuple[str, ...] = ()
     _opened_by: int
 

@@ -26,6 +26,15 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def shared_cases() -> Path:
+    """Inputs that once went wrong; others' data, and not part of the project."""
+    folder = ROOT.parent / "shared" / "cases"
+    if not folder.is_dir():
+        pytest.skip(f"no inputs that went wrong: {folder.name} is not beside the project")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def virtual_driver() -> Path:
     """The virtual sensor's driver for the real OpenNI2 runtime, compiled."""
     try:

@@ -19,9 +19,8 @@ import numpy as np
 from selective_depth.app.benchmark.peers import peer_seconds
 from selective_depth.app.commands.run import Session
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.pipeline import RunReport, StageSummary
+from selective_depth.app.pipeline import RunReport, StageSummary, open_and_tell
 from selective_depth.app.settings import RunOptions, Settings, ViewerOptions
-from selective_depth.drivers.open import open_source
 from selective_depth.selectors.improvement import ImprovementSelector
 from selective_depth.selectors.neural_gas import (
     BatchNeuralGas,
@@ -152,7 +151,7 @@ def bench(
 
 def _seeds_of(source: str, frames: int | None) -> list[SeedGrid]:
     seeds = []
-    with open_source(source) as opened:
+    with open_and_tell(source) as opened:
         if opened.frame_count is None and frames is None:
             raise UsageError(
                 f"'{source}' never ends; say how many frames to time, as in --frames 300."

@@ -27,10 +27,9 @@ from selective_depth.app.pictures.panels import (
     tinted,
 )
 from selective_depth.app.pictures.sheets import WIDTH_IN, Row
-from selective_depth.app.pipeline import say
+from selective_depth.app.pipeline import open_and_tell, say
 from selective_depth.app.settings import PictureOptions
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.open import open_source
 from selective_depth.selectors.neural_gas import (
     EdgeMetric,
     NeuralGasSelector,
@@ -365,7 +364,7 @@ def tabulate_nodes(source: str, *, every: int | None, out: Path | None) -> int:
         If the source has no frame, or never ends and `every` is given.
     """
     check_output(out)
-    with open_source(source) as opened:
+    with open_and_tell(source) as opened:
         if every is not None and opened.frame_count is None:
             raise UsageError(
                 f"'{source}' never ends; record some of it first, or leave out --every to take"

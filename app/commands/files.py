@@ -11,11 +11,10 @@ from rich.table import Table
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
-from selective_depth.app.pipeline import say
+from selective_depth.app.pipeline import open_and_tell, say
 from selective_depth.drivers.folder import FolderWriter
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni import OniReport, OniWriter, export_oni, inspect_oni, repair_oni
-from selective_depth.drivers.open import open_source
 from selective_depth.drivers.source import DepthSource
 
 MOST_PROBLEMS = 20
@@ -81,7 +80,7 @@ def export(source: str, out: Path, frames: int | None) -> int:
             readable = export_oni(source, out, progress.update, frames=frames).readable_frames
             count = readable if frames is None else min(readable, frames)
         else:
-            with open_source(source) as opened:
+            with open_and_tell(source) as opened:
                 if opened.frame_count is None and frames is None:
                     raise UsageError(
                         f"'{source}' never ends; say how many frames to save, as in --frames 100."

@@ -26,6 +26,7 @@ from selective_depth.app.pipeline import (
     RunReport,
     SensorNote,
     is_settings,
+    open_and_tell,
     print_report,
     save_settings,
     say,
@@ -34,7 +35,6 @@ from selective_depth.app.pipeline import (
 from selective_depth.app.settings import Settings
 from selective_depth.app.viewer import Viewer, join_command
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.open import open_source
 from selective_depth.drivers.realtime import RealtimeSource
 from selective_depth.drivers.source import DepthSource
 from selective_depth.selectors.parallel import default_threads
@@ -143,7 +143,7 @@ class Session:
         report = self.report
         with ExitStack() as stack:
             with waiting(f"Opening {self._uri}"):
-                source = stack.enter_context(open_source(self._uri))
+                source = stack.enter_context(open_and_tell(self._uri))
             sensor = source.live
             if self.settings.run.realtime and not sensor:
                 source = stack.enter_context(RealtimeSource(source))

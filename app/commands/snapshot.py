@@ -17,11 +17,10 @@ from selective_depth.app.console.output import (
 )
 from selective_depth.app.console.progress import waiting
 from selective_depth.app.pictures import StillRow, alone, contact_sheet, panels_of, write_picture
-from selective_depth.app.pipeline import Pipeline, say
+from selective_depth.app.pipeline import Pipeline, open_and_tell, say
 from selective_depth.app.settings import PictureOptions, Settings
 from selective_depth.drivers.errors import SourceEndedError
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.open import open_source
 
 
 def short_name(uri: str) -> str:
@@ -38,7 +37,7 @@ def nth_frame(uri: str, number: int) -> DepthFrame:
     UsageError
         If the source has fewer frames.
     """
-    with open_source(uri) as source:
+    with open_and_tell(uri) as source:
         for reached in range(number + 1):
             try:
                 frame = source.read()

@@ -33,9 +33,12 @@ from typing import Any
 
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.settings_file import preset_arguments, settings_arguments
+from selective_depth.drivers.options import appended
 
 PROGRAM = "selective-depth"
 SHELLS = ("bash", "zsh")
+SOURCES = ("source", "sources", "device")
+"""Parameters of commands that name what `open_source` opens."""
 Run = Callable[..., int | None]
 Example = tuple[str, str]
 
@@ -115,6 +118,12 @@ def overview(examples: Sequence[Example]) -> str:
         "  --debug              show the traceback of an error",
         "  --settings FILE      take options from a TOML file; the command line wins",
         "  --preset paper       take the options that the paper's section V was made with",
+        "With any command that takes a SOURCE, for what it does not say of itself:",
+        "  --scale N            values per metre of a folder's images, as 1000 or 5000",
+        "  --camera FX,FY,CX,CY intrinsics in pixels",
+        "  --mode 640x480@30    of a sensor",
+        "  --topic NAME         of a ROS bag",
+        "  --stream N           which depth stream of an .oni file, from 1",
         "Alone:",
         "  --version            versions of this program and of the OpenNI2 runtime found",
         f"  --completion SHELL   print a completion script for {', '.join(SHELLS)}",
@@ -185,6 +194,32 @@ def parse_with_settings(
     except UsageError as error:
         parse(chosen, arguments)  # or is it what was typed that is wrong?
         raise UsageError(f"{error} That option stands in '{file}'.") from None
+
+
+def with_source_options(call: Callable[[], int | None], given: dict[str, str]) -> Callable[[], Any]:
+    """A parsed call whose sources, or sensor, have these options after their names.
+
+    Raises
+    ------
+    UsageError
+        If the command takes none.
+    """
+    if not given:
+        return call
+    run = call.func  # type: ignore[attr-defined]  # a partial, as `parse` makes it
+    bound = inspect.signature(run).bind(*call.args, **call.keywords)  # type: ignore[attr-defined]
+    bound.apply_defaults()
+    names = [name for name in SOURCES if bound.arguments.get(name) is not None]
+    if not names:
+        raise UsageError(f"--{next(iter(given))} is an option of a source, and none is named.")
+    for name in names:
+        value = bound.arguments[name]
+        bound.arguments[name] = (
+            appended(value, given)
+            if isinstance(value, str)
+            else tuple(appended(each, given) for each in value)
+        )
+    return functools.partial(run, *bound.args, **bound.kwargs)
 
 
 def _one_line(boxed: str, name: str) -> str:

@@ -18,9 +18,11 @@ from selective_depth.app.console.command import (
     find,
     overview,
     parse_with_settings,
+    with_source_options,
 )
 from selective_depth.app.console.errors import AppError, UsageError
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, MISUSED, OK
+from selective_depth.drivers.options import ON_COMMANDS
 
 NARROWEST = 40
 """Columns; in fewer, the parser's help can take for ever to find its line breaks."""
@@ -77,7 +79,9 @@ def _dispatch(words: list[str], verbose: bool, examples: Sequence[Example]) -> i
         file = _value(typed, "--settings", "a file: --settings FILE.toml")
         preset = _value(typed, "--preset", "a name: --preset paper")
         settings = None if file is None else Path(file)
-        return parse_with_settings(find(first), typed, settings, preset)() or OK
+        given = {each: _value(typed, f"--{each}", "a value") for each in ON_COMMANDS}
+        call = parse_with_settings(find(first), typed, settings, preset)
+        return with_source_options(call, {k: v for k, v in given.items() if v is not None})() or OK
     return OK
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of, strategy_of
+from selective_depth.app.pipeline import open_and_tell
 from selective_depth.app.settings import Settings
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import DepthFrame
@@ -253,7 +254,7 @@ def _most(sources: Sequence[str], every: int, frames: int | None) -> int:
     """How many frames `frames_of` finds, if all of them show something."""
     total = 0
     for uri in sources:
-        with open_source(uri) as source:
+        with open_and_tell(uri) as source:
             count = ENDLESS_FRAMES if source.frame_count is None else source.frame_count
         total += min(-(-count // every), frames or count)
     return total

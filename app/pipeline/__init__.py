@@ -1,6 +1,6 @@
 """One frame's way: a frame in; seeds, both selectors, the samples and the model out."""
 
-from selective_depth.app.pipeline.feed import Feed, Read, state_of
+from selective_depth.app.pipeline.feed import Feed, Read, open_and_tell, state_of
 from selective_depth.app.pipeline.pipeline import Pipeline
 from selective_depth.app.pipeline.report import (
     RunReport,
@@ -24,6 +24,7 @@ __all__ = [
     "StageSummary",
     "StageTimes",
     "is_settings",
+    "open_and_tell",
     "print_report",
     "save_settings",
     "say",

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from selective_depth.app.console import interrupt
+from selective_depth.app.pipeline.report import say
 from selective_depth.drivers.errors import (
     DamagedRecordingError,
     DeviceLostError,
@@ -14,7 +15,17 @@ from selective_depth.drivers.errors import (
     SourceTimeoutError,
 )
 from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.open import open_source
 from selective_depth.drivers.source import DepthSource
+
+
+def open_and_tell(uri: str) -> DepthSource:
+    """Open a source and say first what it is read as, where its own name does not tell."""
+    source = open_source(uri)
+    if source.about:
+        say(source.about)
+    return source
+
 
 POLL_S = 0.5
 """How long a live sensor may be silent before its state is shown."""

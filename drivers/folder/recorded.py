@@ -1,31 +1,18 @@
-"""Recorded folders: depth frames as 16-bit PNG files, read.
+"""Recorded folders: depth frames as image files, in the layouts of `layouts`, read.
 
-Four layouts are known by their file names. Values per metre, cameras and the mark of a missing
-measurement are those that the publishers state:
-
-======== ============================ =============== =========================================
-layout   files                        values a metre  camera at 640x480
-======== ============================ =============== =========================================
-plain    ``*.png``                    1000            a Kinect's (`Camera.kinect`)
-TUM      ``depth.txt``, ``depth/``    5000            by sequence: freiburg1, 2, 3; else 525
-7-Scenes ``frame-*.depth.png``        1000            585, 585, 320, 240; 65535 = missing
-Redwood  ``depth/*.png``              1000            525, 525, 319.5, 239.5
-======== ============================ =============== =========================================
-
-A sidecar, ``frames.toml`` in the folder, overrides what the layout means. It names no files, so
+What the values mean is said by, in this order: an option of the source, the sidecar
+``frames.toml``, a file of intrinsics beside the frames, the layout. The sidecar names no files, so
 it cannot lead outside the folder.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as FutureTimeoutError
-from dataclasses import dataclass, field
-from decimal import Decimal
-from pathlib import Path, PurePosixPath
-from typing import Final
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -33,37 +20,27 @@ import numpy.typing as npt
 from selective_depth.drivers.errors import (
     DamagedRecordingError,
     SourceEndedError,
-    SourceNotFoundError,
+    SourceError,
     SourceTimeoutError,
 )
-from selective_depth.drivers.folder.images import read_png, read_png_size
-from selective_depth.drivers.folder.sidecar import SIDECAR, Sidecar, read_sidecar, read_text
+from selective_depth.drivers.folder.cameras import CameraFile, find_camera_file
+from selective_depth.drivers.folder.images import read_raw, read_size, read_stack
+from selective_depth.drivers.folder.layouts import ARRAYS, Found, doubtful_order, find_layout
+from selective_depth.drivers.folder.sidecar import SIDECAR, Sidecar, read_sidecar
 from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
 from selective_depth.drivers.source import DepthSource
 
 _MILLIMETRES: Final = 1000.0
-_TUM_SCALE: Final = 5000.0
 _DEFAULT_FPS: Final = 30.0
-_TUM_CAMERAS: Final = {
-    "1": Camera(640, 480, 517.3, 516.5, 318.6, 255.3),
-    "2": Camera(640, 480, 520.9, 521.0, 325.1, 249.7),
-    "3": Camera(640, 480, 535.4, 539.2, 320.1, 247.6),
-}
-_PRIMESENSE: Final = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-_SEVEN_SCENES: Final = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
-
-
-_DECIMAL: Final = r"[0-9]{1,30}\.[0-9]{1,30}"
-"""A file name that is one number: a time, as a rule."""
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """What was found in a folder, and what its kind of layout means."""
-
-    name: str
-    files: list[Path]
-    means: Sidecar = field(default_factory=Sidecar)
+_LOOKS: Final = 5
+"""Frames that are looked at before a scale that is only the custom is believed."""
+_NEAREST_M, _NEAR_M = 0.4, 0.8
+"""A twentieth of the pixels nearer than the first, or half nearer than the second: no room that a
+Kinect sees, but millimetres read at 5000 a metre."""
+_FAR_M: Final = 15.0
+"""Beyond it lies no half of a room in millimetres; said, not refused."""
+_FARTHEST_M: Final = 100.0
+"""No sensor's frame has half of its pixels beyond it: floating-point millimetres."""
 
 
 class RecordedFolder(DepthSource):
@@ -75,44 +52,72 @@ class RecordedFolder(DepthSource):
     Parameters
     ----------
     path : str or Path
-        A folder of 16-bit grey PNG files in one of the layouts above.
+        A folder of depth images in one of the layouts of `layouts`, or one .npy or .npz file.
+    values_per_metre : float, optional
+        Scale of the images; default as the sidecar, a file beside or the layout says.
+    intrinsics : (float, float, float, float), optional
+        fx, fy, cx, cy in pixels; default likewise, and else a Kinect's.
 
     Attributes
     ----------
     layout : str
-        ``plain``, ``TUM``, ``7-Scenes`` or ``Redwood``.
+        Name of the layout, as ``plain``, ``TUM`` or ``7-Scenes``.
+    found : Found
+        The layout's row, its root and the depth images.
 
     Raises
     ------
     SourceNotFoundError
         If there is no folder, or no depth frame in it.
     DamagedRecordingError
-        If a file is no 16-bit grey PNG, the sizes differ, or the sidecar is wrong.
+        If a file is no depth image, the sizes differ, or the sidecar is wrong.
+    SourceError
+        If the scale cannot be known.
     """
 
     live = False
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        values_per_metre: float | None = None,
+        intrinsics: tuple[float, ...] | None = None,
+    ) -> None:
         self.uri = str(path)
-        folder = _root_of(Path(path))
-        layout = _find_layout(folder)
-        sidecar = read_sidecar(folder)
-        settings = sidecar.over(layout.means)
-        self.layout = layout.name
-        self._files = layout.files
-        self.notes = _doubtful_order(layout.files)
-        self.frame_count = len(layout.files)
+        path = Path(path)
+        self._stack = read_stack(path) if path.is_file() else None
+        if self._stack is None:
+            self.found = find_layout(path)
+            inside = self.found.files[0].parent
+            side = next((f for f in (self.found.root, inside) if (f / SIDECAR).exists()), path)
+            sidecar, beside = read_sidecar(side), find_camera_file(self.found.root)
+        else:
+            self.found = Found(ARRAYS, path.parent, [path] * len(self._stack))
+            sidecar, beside = Sidecar(), None
+        self.layout = self.found.row.name
+        self._files = self.found.files
+        self.notes = doubtful_order(self._files)
+        self.frame_count = len(self._files)
         self.dropped = 0
-        self.camera = _camera_of(layout, sidecar.camera)
-        self._timestamps_us = settings.timestamps_us
+        shape = _shape_of(self._files, sidecar.camera) if self._stack is None else self._size()
+        self.camera, camera_from = self._camera(shape, intrinsics, sidecar.camera, beside)
+        self._timestamps_us = sidecar.timestamps_us or self.found.timestamps_us
         if self._timestamps_us is not None and len(self._timestamps_us) != self.frame_count:
             raise DamagedRecordingError(
                 f"'{path}' holds {self.frame_count} frames, but {SIDECAR} lists"
                 f" {len(self._timestamps_us)} timestamps; correct the list or remove it."
             )
-        self.fps = settings.fps or _fps_from(self._timestamps_us)
-        self._to_mm = _millimetre_table(
-            settings.values_per_metre or _MILLIMETRES, settings.missing or ()
+        self.fps = sidecar.fps or _fps_from(self._timestamps_us)
+        marks = self.found.row.marks if sidecar.missing is None else sidecar.missing
+        said = values_per_metre or sidecar.values_per_metre
+        where = "as given" if values_per_metre else SIDECAR
+        if said is None and beside is not None and beside.values_per_metre is not None:
+            said, where = beside.values_per_metre, beside.path.name
+        self._convert, scale = self._conversion(said, where, marks)
+        self.about = (
+            f"'{self.uri}' is read as {self.layout}: {scale}; camera fx {self.camera.fx:g} fy"
+            f" {self.camera.fy:g} cx {self.camera.cx:g} cy {self.camera.cy:g} ({camera_from})."
         )
         self._next = 0
         self._ahead: Future[DepthFrame] | None = None
@@ -147,7 +152,7 @@ class RecordedFolder(DepthSource):
 
     def _load(self, index: int) -> DepthFrame:
         path = self._files[index]
-        raw = read_png(path)
+        raw = self._raw(index)
         if raw.shape != (self.camera.height, self.camera.width):
             # The header was right when the folder was opened: the file has changed since.
             raise _size_error(path, raw.shape, self.camera)
@@ -155,134 +160,125 @@ class RecordedFolder(DepthSource):
             timestamp_us = round(index * 1e6 / self.fps)
         else:
             timestamp_us = self._timestamps_us[index]
-        depth_mm = raw if self._to_mm is None else self._to_mm[raw]
+        depth_mm = self._convert(raw)
         depth_mm.flags.writeable = False  # handed over: the frame need not copy it
         return DepthFrame(depth_mm, index, timestamp_us, self.camera, self.uri)
 
+    def _raw(self, index: int) -> npt.NDArray[Any]:
+        return read_raw(self._files[index]) if self._stack is None else self._stack[index]
 
-def _root_of(path: Path) -> Path:
-    if not path.is_dir():
-        raise SourceNotFoundError(f"the folder '{path}' does not exist; check its name.")
-    # The inner folder of a TUM sequence has another scale than its PNG files tell.
-    if path.name == "depth" and (path.parent / "depth.txt").is_file():
-        return path.parent
-    return path
+    def _size(self) -> tuple[int, int]:
+        height, width = self._raw(0).shape
+        return height, width
 
-
-def _find_layout(folder: Path) -> _Layout:
-    names = _png_names(folder)
-    if (folder / "depth.txt").is_file():
-        layout = _tum_layout(folder)
-    elif scenes := [name for name in names if name.endswith(".depth.png")]:
-        means = Sidecar(camera=_SEVEN_SCENES, missing=(65535,))
-        layout = _Layout("7-Scenes", [folder / name for name in scenes], means)
-    elif not names and (inner := _png_names(folder / "depth")):
-        layout = _redwood_layout(folder / "depth", inner)
-    else:
-        layout = _Layout("plain", [folder / name for name in names])
-    if not layout.files:
-        raise SourceNotFoundError(_nothing_found(folder))
-    return layout
-
-
-def _png_names(folder: Path) -> list[str]:
-    """PNG files of a folder in natural order: 2 before 10."""
-    if not folder.is_dir():
-        return []
-    try:
-        names = [entry.name for entry in folder.iterdir() if entry.suffix.lower() == ".png"]
-    except OSError as error:
-        raise SourceNotFoundError(
-            f"the folder '{folder}' cannot be read ({error.strerror}); check its permissions."
-        ) from error
-    return sorted((name for name in names if not name.startswith(".")), key=_natural_key)
-
-
-def _natural_key(name: str) -> list[tuple[int, Decimal, str]]:
-    stem = name.rpartition(".")[0]
-    if re.fullmatch(_DECIMAL, stem):
-        return [(0, Decimal(stem), name)]
-    parts = re.findall(r"[0-9]+|[^0-9]+", name)
-    return [
-        (0, Decimal(part), part) if part.isdecimal() else (1, Decimal(0), part) for part in parts
-    ]
-
-
-def _doubtful_order(files: list[Path]) -> tuple[str, ...]:
-    """Say it where the names can be read as two kinds of numbers, which order them differently."""
-    matches = [re.fullmatch(r"([0-9]+)\.([0-9]+)", path.stem) for path in files]
-    pairs = [(int(each[1]), int(each[2])) for each in matches if each]
-    if len(pairs) < len(files) or pairs == sorted(pairs):
-        return ()
-    return (
-        f"the names of the frames ('{files[0].name}', …) are read as decimal numbers. If they are"
-        f" seconds and nanoseconds without leading zeros, that is another order: rename them.",
-    )
-
-
-def _tum_layout(path: Path) -> _Layout:
-    """Read ``depth.txt``: lines of a timestamp in seconds and a file, '#' begins a comment."""
-    index = path / "depth.txt"
-    files, timestamps_us = [], []
-    for number, line in enumerate(read_text(index).splitlines(), start=1):
-        words = line.partition("#")[0].split()
-        if not words:
-            continue
-        try:
-            seconds, name = words
-            timestamp_us = round(float(seconds) * 1e6)
-        except (ValueError, OverflowError):
-            raise DamagedRecordingError(
-                f"line {number} of '{index}' is {line!r:.80}; each line is a time in seconds and"
-                " the name of a PNG file."
-            ) from None
-        inside = PurePosixPath(name)
-        if inside.is_absolute() or ".." in inside.parts or "\\" in name or ":" in name:
-            raise DamagedRecordingError(
-                f"line {number} of '{index}' names '{name:.80}', which may lie outside of the"
-                " folder; name files inside it, as in depth/0001.png."
+    def _camera(
+        self,
+        shape: tuple[int, int],
+        given: tuple[float, ...] | None,
+        sidecar: Camera | None,
+        beside: CameraFile | None,
+    ) -> tuple[Camera, str]:
+        """The camera, and where it comes from."""
+        height, width = shape
+        known = self.found.row.camera
+        if given is not None:
+            return Camera(width, height, *given), "as given"
+        if sidecar is not None:
+            return sidecar, SIDECAR
+        if beside is not None and beside.intrinsics is not None:
+            if camera := beside.camera(width, height):
+                if beside.varies:
+                    self.notes += (
+                        f"'{beside.path}' has other intrinsics for other frames; those of its first"
+                        " are used for all.",
+                    )
+                return camera, beside.path.name
+            self.notes += (
+                f"the intrinsics in '{beside.path}' cannot be those of images of {width}x{height}"
+                " pixels and are not used; give --camera fx,fy,cx,cy if you know them.",
             )
-        files.append(path / inside)
-        timestamps_us.append(timestamp_us)
-    known = re.search(r"freiburg([123])", path.resolve().name)
-    camera = _TUM_CAMERAS[known[1]] if known else _PRIMESENSE
-    means = Sidecar(_TUM_SCALE, camera, timestamps_us=tuple(timestamps_us))
-    return _Layout("TUM", files, means)
+        if known is not None and (known.width, known.height) == (width, height):
+            return known, f"the {self.layout} layout's"
+        # A known layout at an unusual size: its camera was calibrated for another.
+        return Camera.kinect(width, height), "assumed, a Kinect's"
+
+    def _conversion(
+        self, said: float | None, where: str, marks: Iterable[int]
+    ) -> tuple[Callable[[npt.NDArray[Any]], DepthArray], str]:
+        """How raw values become millimetres, and that in words.
+
+        Raises
+        ------
+        SourceError
+            If the scale is only the custom, and what it makes of the frames cannot be.
+        """
+        row = self.found.row
+        where = where if said else "assumed" if row.assumed else f"the {row.name} layout's"
+        png = self._stack is None and self._files[0].suffix.lower() == ".png"
+        kind = np.dtype(np.uint16) if png else self._raw(0).dtype
+        look = said is None and (row.assumed or kind.kind == "f")
+        seen = self._look() if look else np.empty(0)
+        if kind.kind == "f":
+            scale = said or (_MILLIMETRES if seen.size and np.median(seen) > _FARTHEST_M else 1.0)
+            where = where if said else "told by their size"
+            names = {1.0: "metres", _MILLIMETRES: "millimetres"}
+            words = f"{names.get(scale, f'{scale:g} values a metre')} in floating point ({where})"
+        elif row.convert is not None and said is None:
+            convert = row.convert
+            table = convert(np.arange(65536, dtype=np.float64))
+            return _by_table(table, marks), f"its own coding of millimetres ({where})"
+        else:
+            scale = said or row.values_per_metre
+            if seen.size:
+                self._doubt(seen / scale, scale)
+            words = f"{scale:g} values a metre ({where})"
+        if kind == np.uint16:
+            values = np.arange(65536, dtype=np.float64)
+            return _by_table(np.rint(values * (_MILLIMETRES / scale)), marks), words
+        factor = _MILLIMETRES / scale
+
+        def scaled(raw: npt.NDArray[Any]) -> DepthArray:
+            with np.errstate(invalid="ignore", over="ignore"):
+                depth_mm = np.rint(np.where(np.isin(raw, list(marks)), 0, raw) * factor)
+                within = (depth_mm > 0) & (depth_mm <= 65535)
+            return np.where(within, depth_mm, 0).astype(np.uint16)
+
+        return scaled, words
+
+    def _look(self) -> npt.NDArray[Any]:
+        """What some frames measured; those that are damaged say so when they are read."""
+        seen = [np.empty(0)]
+        for index in range(0, len(self._files), len(self._files) // _LOOKS + 1):
+            with suppress(DamagedRecordingError):
+                raw = self._raw(index)
+                seen.append(raw[np.isfinite(raw) & (raw > 0)])
+        return np.concatenate(seen)
+
+    def _doubt(self, seen_m: npt.NDArray[np.float64], scale: float) -> None:
+        near_m, median_m = np.percentile(seen_m, (5, 50))
+        if scale == _MILLIMETRES:
+            if median_m > _FAR_M:
+                self.notes += (
+                    f"half of what '{self.uri}' shows is beyond {median_m:.3g} m, if its values are"
+                    " millimetres, as is assumed. If they are not, give --scale VALUES_PER_METRE.",
+                )
+        elif near_m < _NEAREST_M or median_m < _NEAR_M:
+            raise SourceError(
+                f"the scale of '{self.uri}' is not known: at {scale:g} values a metre, the custom"
+                f" of its layout, half of it would be nearer than {median_m:.2g} m. Give --scale"
+                f" 1000 if its values are millimetres, or --scale {scale:g} if it is so near."
+            )
 
 
-def _redwood_layout(folder: Path, names: list[str]) -> _Layout:
-    """Redwood's names are ``<frame>-<microseconds>.png`` or plain numbers."""
-    stamps = [re.fullmatch(r"[0-9]+-([0-9]{1,15})\.png", name) for name in names]
-    timestamps_us = tuple(int(stamp[1]) for stamp in stamps if stamp)
-    means = Sidecar(
-        camera=_PRIMESENSE,
-        timestamps_us=timestamps_us if len(timestamps_us) == len(names) else None,
-    )
-    return _Layout("Redwood", [folder / name for name in names], means)
-
-
-def _nothing_found(path: Path) -> str:
-    looked = (
-        f"no depth frames in '{path}': looked for 16-bit PNG files in it and in '{path / 'depth'}'"
-    )
-    for inner in sorted(path.iterdir()):
-        if inner.is_dir() and (count := len(_png_names(inner))):
-            return f"{looked}. '{inner}' holds PNG files ({count}): give that folder."
-    return f"{looked}, and for depth.txt. Give a folder that holds them."
-
-
-def _camera_of(layout: _Layout, stated: Camera | None) -> Camera:
-    """The camera of a folder, after checking the header of every file against it."""
-    height, width = read_png_size(layout.files[0])
-    camera = stated or layout.means.camera
-    # A known layout at an unusual size: its camera was calibrated for 640x480.
-    if camera is None or (stated is None and (camera.height, camera.width) != (height, width)):
-        camera = Camera.kinect(width, height)
-    for path in layout.files:
-        shape = read_png_size(path)
-        if shape != (camera.height, camera.width):
-            raise _size_error(path, shape, camera)
-    return camera
+def _shape_of(files: list[Path], stated: Camera | None) -> tuple[int, int]:
+    """Height and width, after checking the header of every file."""
+    first = (stated.height, stated.width) if stated else read_size(files[0])
+    for path in files:
+        if path.suffix.lower() == ".png" or path is files[0]:
+            shape = read_size(path)
+            if shape != first:
+                raise _size_error(path, shape, Camera.kinect(first[1], first[0]))
+    return first
 
 
 def _size_error(path: Path, shape: tuple[int, ...], camera: Camera) -> DamagedRecordingError:
@@ -301,18 +297,16 @@ def _fps_from(timestamps_us: tuple[int, ...] | None) -> float:
     return round(1e6 / step_us, 3) if 1e3 <= step_us <= 1e9 else _DEFAULT_FPS
 
 
-def _millimetre_table(
-    values_per_metre: float, missing: Iterable[int]
-) -> npt.NDArray[np.uint16] | None:
-    """Millimetres of each PNG value; None where the values are millimetres as they stand.
+def _by_table(
+    depth_mm: npt.NDArray[np.float64], marks: Iterable[int]
+) -> Callable[[npt.NDArray[Any]], DepthArray]:
+    """Conversion of 16-bit values by a table of millimetres.
 
     Values beyond 65,535 mm cannot be held and become 0, no measurement.
     """
-    values = np.arange(65536, dtype=np.float64)
-    depth_mm = np.rint(values * (_MILLIMETRES / values_per_metre))
     depth_mm[depth_mm > 65535] = 0
-    depth_mm[list(missing)] = 0
-    if np.array_equal(depth_mm, values):
-        return None
-    table: DepthArray = depth_mm.astype(np.uint16)
-    return table
+    depth_mm[list(marks)] = 0
+    if np.array_equal(depth_mm, np.arange(65536)):
+        return lambda raw: raw  # millimetres as they stand
+    table: DepthArray = np.rint(depth_mm).astype(np.uint16)
+    return lambda raw: table[raw]

@@ -21,7 +21,7 @@ Every entry may be left out. TOML is read by the standard library and can only h
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -60,11 +60,6 @@ class Sidecar:
     fps: float | None = None
     missing: tuple[int, ...] | None = None
     timestamps_us: tuple[int, ...] | None = None
-
-    def over(self, known: Sidecar) -> Sidecar:
-        """These settings, completed by what else is known."""
-        said = {name: value for name, value in vars(self).items() if value is not None}
-        return replace(known, **said)
 
 
 def read_sidecar(folder: Path) -> Sidecar:

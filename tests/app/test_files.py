@@ -12,6 +12,7 @@ from selective_depth.app.cli import run
 from selective_depth.app.commands.files import export
 from selective_depth.app.console.errors import UsageError
 from selective_depth.drivers.folder import RecordedFolder, write_folder
+from selective_depth.drivers.folder.images import write_png
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.oni import OniReader, inspect_oni, write_oni
 from selective_depth.drivers.open import open_source
@@ -80,7 +81,7 @@ def test_a_source_without_end_needs_a_number(
         def close(self) -> None:
             pass
 
-    monkeypatch.setattr("selective_depth.app.commands.files.open_source", lambda _: Endless())
+    monkeypatch.setattr("selective_depth.app.pipeline.feed.open_source", lambda _: Endless())
     assert run(["export", "openni", str(tmp_path / "out")]) == 2
     assert "'openni' never ends; say how many" in capsys.readouterr().err
     assert run(["export", "openni", str(tmp_path / "out"), "--frames", "3"]) == 0
@@ -186,3 +187,19 @@ def test_a_principal_point_that_is_lost_is_told(
     assert "not (30, 24)" in capsys.readouterr().out
     assert export("virtual:ball?size=64x48&frames=1", tmp_path / "b.oni", None) == 0
     assert "principal point" not in capsys.readouterr().out
+
+
+def test_options_of_a_source_are_given_on_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number in range(2):
+        (tmp_path / "in" / "depth").mkdir(parents=True, exist_ok=True)
+        write_png(tmp_path / "in" / "depth" / f"{number}.png", np.full((48, 64), 1500, np.uint16))
+    words = [str(tmp_path / "in"), str(tmp_path / "out"), "--scale", "500", "--camera=60,61,32,24"]
+    assert run(["export", *words]) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert "read as Redwood: 500 values a metre (as given); camera fx 60 fy 61" in first
+    with open_source(tmp_path / "out") as saved:
+        assert (saved.camera.fx, saved.read().depth_mm[0, 0]) == (60, 3000)
+    assert run(["devices", "--scale", "500"]) == 2
+    assert "--scale is an option of a source" in capsys.readouterr().err
