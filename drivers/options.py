@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import MOST_PX
 
-ON_COMMANDS = ("scale", "camera", "mode", "topic", "stream")
-"""Options of sources that every command takes as ``--NAME VALUE``, see `appended`."""
 SMALLEST, LARGEST = 16, 4096
 """Bounds of a frame's width and height in pixels that `Options.size` accepts."""
 

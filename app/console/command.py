@@ -33,10 +33,11 @@ from typing import Any
 
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.settings_file import preset_arguments, settings_arguments
-from selective_depth.drivers.options import appended
 
 PROGRAM = "selective-depth"
 SHELLS = ("bash", "zsh")
+SOURCE_OPTIONS = ("scale", "camera", "mode", "topic", "stream")
+"""Options of sources, which every command that opens one takes as ``--NAME VALUE``."""
 SOURCES = ("source", "sources", "device")
 """Parameters of commands that name what `open_source` opens."""
 Run = Callable[..., int | None]
@@ -212,6 +213,8 @@ def with_source_options(call: Callable[[], int | None], given: dict[str, str]) -
     names = [name for name in SOURCES if bound.arguments.get(name) is not None]
     if not names:
         raise UsageError(f"--{next(iter(given))} is an option of a source, and none is named.")
+    from selective_depth.drivers.options import appended
+
     for name in names:
         value = bound.arguments[name]
         bound.arguments[name] = (

@@ -13,6 +13,7 @@ from pathlib import Path
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.command import (
     PROGRAM,
+    SOURCE_OPTIONS,
     Example,
     completion,
     find,
@@ -22,7 +23,6 @@ from selective_depth.app.console.command import (
 )
 from selective_depth.app.console.errors import AppError, UsageError
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, MISUSED, OK
-from selective_depth.drivers.options import ON_COMMANDS
 
 NARROWEST = 40
 """Columns; in fewer, the parser's help can take for ever to find its line breaks."""
@@ -79,7 +79,7 @@ def _dispatch(words: list[str], verbose: bool, examples: Sequence[Example]) -> i
         file = _value(typed, "--settings", "a file: --settings FILE.toml")
         preset = _value(typed, "--preset", "a name: --preset paper")
         settings = None if file is None else Path(file)
-        given = {each: _value(typed, f"--{each}", "a value") for each in ON_COMMANDS}
+        given = {each: _value(typed, f"--{each}", "a value") for each in SOURCE_OPTIONS}
         call = parse_with_settings(find(first), typed, settings, preset)
         return with_source_options(call, {k: v for k, v in given.items() if v is not None})() or OK
     return OK
