@@ -21,7 +21,7 @@ def open_source(uri: str | Path) -> DepthSource:
     ----------
     uri : str or Path
         ``openni`` or ``openni:<device uri>``, a live sensor through OpenNI2;
-        ``<file>.oni``, a recording, replayed frame by frame;
+        ``<file>.oni``, a recording, replayed frame by frame (``?stream=2``: its second depth);
         ``<folder>``, depth images in one of two dozen layouts; ``<file>.npy`` or ``.npz``;
         after ``?`` their ``scale`` (values per metre) and ``camera`` (fx,fy,cx,cy);
         ``virtual:<scene>``, a virtual Kinect in a made scene, with options after ``?``;
@@ -65,8 +65,9 @@ def open_source(uri: str | Path) -> DepthSource:
     if suffix == ".oni":
         from selective_depth.drivers.oni import OniReader
 
+        stream, intrinsics = options.integer("stream", 1, 1, 64), options.camera()
         options.done()
-        return OniReader(path)
+        return OniReader(path, stream=stream, intrinsics=intrinsics)
     if not path.exists():
         raise SourceNotFoundError(f"'{named}' does not exist. {_WHAT_THERE_IS}")
     raise SourceNotFoundError(

@@ -46,6 +46,8 @@ def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
             " they are read rightly here, but its own player shows them wrong. --repair OUT.oni"
             " writes a file without the flaw"
         )
+    for note in report.notes:
+        say(f"note: {note}")
     if not report.complete and report.readable_frames:
         say(
             f"note: save what is readable with --repair OUT.oni, or as PNG files with"
@@ -137,16 +139,20 @@ def _print_check(report: OniReport) -> None:
         console.print(str(problem), soft_wrap=True, markup=False)
     if len(report.problems) > MOST_PROBLEMS:
         console.print(f"and {len(report.problems) - MOST_PROBLEMS} problems more")
-    console.print(_verdict(report))
+    console.print(_verdict(report), soft_wrap=True, markup=False)
 
 
 def _verdict(report: OniReport) -> str:
+    if report.unsupported:
+        return f"it is not damaged, but cannot be read: {report.unsupported}"
     if report.complete:
         decoded, frames = report.decoded_frames, report.readable_frames
         limit = "" if decoded == frames else f" (only {decoded} frames decoded; see --timeout)"
         return f"nothing is wrong with it{limit}"
     if report.openable:
-        return "it is incomplete, but can be replayed as far as it goes"
+        return f"it is incomplete, but readable to frame {report.readable_frames}"
     if not report.version:
         return "it is not an .oni recording"
-    return "it is damaged; it is replayed up to the damage"
+    place = next(problem for problem in report.problems if not problem.harmless)
+    before = sum(f.record_offset < place.offset for f in report.depth.frames) if report.depth else 0
+    return f"it is damaged at byte {place.offset}; readable to frame {before}"

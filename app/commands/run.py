@@ -150,6 +150,7 @@ class Session:
             report.live = source.live
             _tell(source)
             report.troubles += source.notes
+            told = len(source.notes)
             pipeline = stack.enter_context(Pipeline(self.settings, realtime=source.live))
             frames = _frames_in_all(self.settings.run.frames, source.frame_count)
             viewer = self._open_viewer(pipeline, frames)
@@ -166,6 +167,7 @@ class Session:
                 report.troubles += [*viewer.close(), *viewer.news()]
                 if viewer.file_failed and self._code == OK:
                     self._code = FAILED
+                report.troubles += source.notes[told:]  # what came up on the way
                 report.missed = viewer.dropped
                 report.state = state_of(source)
                 report.dropped = source.dropped - report.dropped_starting

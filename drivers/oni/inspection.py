@@ -10,21 +10,29 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from selective_depth.drivers.frame import Camera
+from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.oni.files import open_regular, read_payload, skip_hole, unreadable
+from selective_depth.drivers.oni.form import (
+    DepthForm,
+    Sides,
+    depth_form,
+    mended_times,
+    no_depth,
+    turned_at,
+    upright,
+)
 from selective_depth.drivers.oni.records import (
     BEGIN_FIELDS,
     CODEC_TABLE,
     CODECS,
-    DEPTH_CODECS,
     FILE_HEADER,
     FRAME_FIELDS,
     IDENTITY,
     MAGIC,
-    MAX_PAYLOAD,
     NODE_ADDITIONS,
     OLD_SEEK_ENTRY,
     OLDEST_VERSION,
@@ -43,18 +51,20 @@ from selective_depth.drivers.oni.records import (
 from selective_depth.drivers.oni.report import STREAMS, OniFrame, OniNode, OniProblem, OniReport
 
 _MAX_NODES: Final = 64
-_MILLIMETRES: Final = 100
-"""OpenNI2's number of the pixel format "depth in millimetres"."""
 _SIZES: Final = {
     "xnMapOutputMode": 12,
     "xnCropping": 12,
     "xnFOV": 16,
     "xnRealWorldTranslationData": 24,
 }
+_SHAPING: Final = ("xnMapOutputMode", "xnCropping", "oniPixelFormat")
+"""Properties that tell what a frame's values are; one that changes ends what can be read."""
 _SCAN_BYTES: Final = 1 << 20
 
 
-def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10.0) -> OniReport:
+def inspect_oni(
+    path: str | Path, *, decode: bool = False, timeout_s: float = 10.0, stream: int = 1
+) -> OniReport:
     """Check an .oni file.
 
     Parameters
@@ -67,6 +77,8 @@ def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10
     timeout_s : float, default 10
         Stop decoding after so many seconds; `decoded_frames` says how far that came. The walk over
         the records has no limit: it takes as long as reading the file once, whatever is in there.
+    stream : int, default 1
+        Which depth stream, from 1.
 
     Raises
     ------
@@ -77,7 +89,7 @@ def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10
     path = Path(path)
     with open_regular(path) as file:
         try:
-            return _Inspection(path, file, timeout_s).report(decode)
+            return _Inspection(path, file, timeout_s, stream).report(decode)
         except OSError as error:
             raise unreadable(path, error) from error
 
@@ -85,8 +97,9 @@ def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10
 class _Inspection:
     """One walk over a file."""
 
-    def __init__(self, path: Path, file: BinaryIO, timeout_s: float) -> None:
+    def __init__(self, path: Path, file: BinaryIO, timeout_s: float, stream: int = 1) -> None:
         self.path = path
+        self.stream = stream
         self.file = file
         self.size = os.fstat(file.fileno()).st_size
         self.deadline = time.monotonic() + timeout_s
@@ -104,24 +117,42 @@ class _Inspection:
         if self._read_header():
             self._walk()
             self._check_counts()
-        depth = next((n for n in self.nodes.values() if n.node_type == NodeType.DEPTH), None)
-        camera, fps, decoded, swapped = None, 30.0, 0, 0
+        nodes = list(self.nodes.values())
+        depths = [node for node in nodes if node.node_type == NodeType.DEPTH]
+        if self.stream > max(1, len(depths)):
+            raise SourceNotFoundError(
+                f"'{self.path}' has {len(depths)} depth streams; ?stream={self.stream} is not among"
+                " them, the first is 1."
+            )
+        depth = depths[self.stream - 1] if depths else None
+        form, decoded, swapped, notes = DepthForm(), 0, 0, self._mend_times()
         if depth is not None:
-            camera, fps = self._check_depth(depth)
-            if camera is None:
+            form = depth_form(depth, self._problem)
+            notes += form.notes
+            if len(depths) > 1:
+                notes += (f"it holds {len(depths)} depth streams; FILE.oni?stream=N is the N-th",)
+        unsupported = form.unsupported
+        if not any(node.is_stream for node in nodes) and self.version:
+            self._problem(0, "the file holds no depth stream")
+        elif self.begun and not (depth and depth.frames) and not self.problems:
+            unsupported = no_depth(nodes)
+        if depth is not None:
+            if form.camera is None:
                 depth.frames.clear()
             elif decode:
-                decoded, swapped = self._decode_frames(depth, camera)
-        elif self.version:
-            self._problem(0, "the file holds no depth stream")
+                decoded, swapped, turned = self._decode_frames(depth, form)
+                notes += tuple(turned)
         return OniReport(
             path=self.path,
             size_bytes=self.size,
             version=self.version,
-            nodes=tuple(self.nodes.values()),
+            nodes=tuple(nodes),
             depth=depth,
-            camera=camera,
-            fps=fps,
+            camera=form.camera,
+            fps=form.fps,
+            tenths=form.tenths,
+            unsupported=unsupported,
+            notes=notes,
             problems=tuple(sorted(self.problems, key=lambda problem: problem.offset)),
             ended=self.end is not None,
             tail_bytes=0 if self.end is None else self.size - self.end,
@@ -130,16 +161,33 @@ class _Inspection:
             swapped_frames=swapped,
         )
 
+    def _mend_times(self) -> tuple[str, ...]:
+        notes = []
+        for node in self.nodes.values():
+            times_us, first = mended_times([frame.timestamp_us for frame in node.frames])
+            if first is not None:
+                number = node.frames[first].number
+                notes.append(
+                    f"the clock of {node.name} jumps at frame {number}; its times are delivered so"
+                    " that they go on rising, and --repair writes them so"
+                )
+                pairs = zip(node.frames, times_us, strict=True)
+                node.frames[:] = [replace(frame, timestamp_us=time) for frame, time in pairs]
+        return tuple(notes)
+
     def _problem(self, offset: int, sentence: str, *, harmless: bool = False) -> None:
         self.problems.append(OniProblem(offset, sentence, harmless))
 
     def _read_header(self) -> bool:
         start = self.file.read(FILE_HEADER.size)
         if start[:4] != IDENTITY:
+            lfs = start.startswith(b"version https://git-lfs"[: FILE_HEADER.size])
             self._problem(
                 0,
                 "the file is empty"
                 if not start
+                else "this is a Git LFS pointer and not the recording; `git lfs pull` fetches it"
+                if lfs
                 else f"this is no .oni file: it begins with {start[:4]!r} instead of {IDENTITY!r}",
             )
             return False
@@ -177,8 +225,21 @@ class _Inspection:
             offset = record.end
             if record.kind is Kind.END:
                 self.end = offset
+                self._walk_beyond_end(offset)
                 return
         self._problem(self.size, "the file ends without its END mark", harmless=True)
+
+    def _walk_beyond_end(self, offset: int) -> None:
+        """OpenNI 1's recorder writes END before it removes the nodes and adds their tables."""
+        while self.end is not None and offset < self.size:
+            try:
+                record = read_record(self.file, offset, self.size, self.old)
+                if record.kind not in (Kind.NODE_REMOVED, Kind.SEEK_TABLE):
+                    return
+                self._handle(record)
+            except RecordError:
+                return  # zeros, as a rule; a table that is needed is missed later
+            self.end = offset = record.end
 
     @staticmethod
     def _cut(error: RecordError) -> bool:
@@ -225,7 +286,7 @@ class _Inspection:
             if node.removed and record.kind is not Kind.SEEK_TABLE:
                 raise RecordError(f"node {record.node} was removed before")
             if record.kind in PROPERTIES:
-                _set_property(node, record)
+                self._set_property(node, record)
             elif record.kind is Kind.STATE_READY:
                 node.ready = True
             elif record.kind is Kind.DATA_BEGIN:
@@ -260,6 +321,15 @@ class _Inspection:
         if addition.node_type in STREAMS and addition.codec not in CODECS:
             raise RecordError(f"the compression {addition.codec!r} is not known")
 
+    def _set_property(self, node: OniNode, record: Record) -> None:
+        name, value = parse_property(record)
+        if len(value) != _SIZES.get(name, len(value)):
+            raise RecordError(f"the property {name} has {len(value)} bytes, not {_SIZES[name]}")
+        if node.frames and name in _SHAPING and node.properties.get(name, (0, value))[1] != value:
+            node.changed = True
+            raise RecordError(f"{name} changes after frame {node.frames[-1].number}")
+        node.properties[name] = (record.kind, value)
+
     def _begin(self, node: OniNode, record: Record) -> None:
         if len(record.fields) != BEGIN_FIELDS.size:
             raise RecordError(f"it has {len(record.fields)} bytes of fields")
@@ -275,6 +345,8 @@ class _Inspection:
             raise RecordError(f"it has {len(record.fields)} bytes of fields")
         if not (node.is_stream and node.ready and self.begun):
             raise RecordError(f"node {node.number} was not ready for frames")
+        if node.changed:
+            return  # what comes now is of another size or unit
         timestamp_us, number = FRAME_FIELDS.unpack(record.fields)
         last = node.frames[-1] if node.frames else None
         if number != (last.number if last else 0) + 1:
@@ -286,15 +358,8 @@ class _Inspection:
                 return
         if timestamp_us > self.latest_us:
             self._problem(record.offset, f"frame {number} is later than the recording's end")
-        elif last is not None and timestamp_us < last.timestamp_us:
-            self._problem(
-                record.offset, f"frame {number} is older than the one before it", harmless=True
-            )
-        node.frames.append(
-            OniFrame(
-                number, timestamp_us, record.offset, record.payload_offset, record.payload_size
-            )
-        )
+        place = record.offset, record.payload_offset, record.payload_size
+        node.frames.append(OniFrame(number, timestamp_us, *place, node.number_of("xnMirror") == 1))
 
     def _check_seek_table(self, node: OniNode, record: Record) -> None:
         form = OLD_SEEK_ENTRY if self.old else SEEK_ENTRY
@@ -331,7 +396,7 @@ class _Inspection:
                     f"the number of {node.name} frames was never written: the recorder was stopped",
                     harmless=node.seek_table_offset == 0,
                 )
-            elif node.declared_frames != there:
+            elif node.declared_frames != there and not node.changed:
                 self._problem(
                     self.size,
                     f"{node.declared_frames} {node.name} frames are announced, {there} are there",
@@ -342,85 +407,33 @@ class _Inspection:
                     f"there is no sound seek table of {node.name} at byte {node.seek_table_offset}",
                 )
 
-    def _check_depth(self, node: OniNode) -> tuple[Camera | None, float]:
-        """Camera and frame rate of the depth stream, after checking what the player relies on."""
-        mode = node.values_of("xnMapOutputMode", "<III")
-        if mode is None:
-            self._problem(node.offset, "the frame size is not recorded")
-            return None, 30.0
-        width, height, fps = (int(value) for value in mode)
-        if not (width and height and 2 * width * height <= MAX_PAYLOAD and 1 <= fps <= 1000):
-            self._problem(node.offset, f"the frames cannot be {width}x{height} at {fps} a second")
-            return None, 30.0
-        if node.codec not in DEPTH_CODECS:
-            return None, fps
-        pixel_format = node.number_of("oniPixelFormat")
-        if pixel_format not in (None, _MILLIMETRES):
-            self._problem(
-                node.offset, f"the pixels have format {pixel_format}, which is not millimetres"
-            )
-            return None, fps
-        cropping = node.values_of("xnCropping", "<IHHHH")
-        if cropping is None:
-            self._problem(
-                node.offset, "the cropping is not recorded: OpenNI2 would deliver no frame at all"
-            )
-        elif cropping[0]:
-            self._problem(node.offset, "the frames are cropped, which cannot be replayed")
-            return None, fps
-        frame_bytes = node.number_of("oniRequiredFrameSize")
-        if frame_bytes not in (None, 2 * width * height):
-            del node.properties["oniRequiredFrameSize"]
-            self._problem(
-                node.offset, f"frames of {width}x{height} do not have {frame_bytes} bytes"
-            )
-        max_depth_mm = node.number_of("xnDeviceMaxDepth")
-        if node.codec == CODEC_TABLE and not 1 <= (max_depth_mm or 0) < 65536:
-            node.properties.pop("xnDeviceMaxDepth", None)
-            self._problem(node.offset, f"the largest depth cannot be {max_depth_mm} mm")
-        return self._camera(node, width, height), fps
+    def _decode_frames(self, node: OniNode, form: DepthForm) -> tuple[int, int, list[str]]:
+        """Drop the frames that cannot be decoded, as far as time allows; mark those turned round.
 
-    def _camera(self, node: OniNode, width: int, height: int) -> Camera:
-        fov_rad = node.values_of("xnFOV", "<dd")
-        optics = node.values_of("xnRealWorldTranslationData", "<ddd")
-        try:
-            if fov_rad is None and optics is not None:
-                # OpenNI 1 at first recorded the size of a pixel at a distance instead.
-                distance, pixel_size, pixels_to_depth = optics
-                focal = distance / (pixel_size * pixels_to_depth)
-                return Camera(width, height, focal, focal, width / 2, height / 2)
-            if fov_rad is not None:
-                return Camera.from_fov(width, height, *fov_rad)
-        except (ValueError, ArithmeticError) as error:
-            node.properties.pop("xnFOV", None)
-            self._problem(node.offset, f"the field of view is wrong: {error}")
-        return Camera.kinect(width, height)
-
-    def _decode_frames(self, node: OniNode, camera: Camera) -> tuple[int, int]:
-        """Drop the frames that cannot be decoded, as far as time allows.
-
-        Returns how many can, and how many of these the recorder swapped the last pixels of.
+        Returns how many can, how many of these the recorder swapped the last pixels of, and a note
+        where they turn round.
         """
         # Compiled code, whose import takes longer than a whole check without it.
         from selective_depth.drivers.oni.codec import decode_depth, mend_order
 
-        decoded, swapped, sound = 0, 0, []
-        size = camera.height, camera.width
+        assert form.camera is not None
+        decoded, swapped, sound, sides, notes = 0, 0, [], Sides(), []
+        size = form.camera.height, form.camera.width
         for frame in node.frames:
             if time.monotonic() < self.deadline:
                 payload = read_payload(self.file, frame)
-                if decode_depth(node.codec, payload, *size) is None:
+                raw = decode_depth(node.codec, payload, *size)
+                if raw is None:
                     self._problem(frame.record_offset, f"frame {frame.number} cannot be decoded")
                     continue
                 decoded += 1
                 swapped += node.codec == CODEC_TABLE and mend_order(payload, *size) is not None
+                turns = sides.turns
+                sides.put_right(upright(raw, form.tenths, frame.mirrored))
+                if sides.turns > turns == 0:
+                    notes.append(f"it {turned_at(frame.number)}")
+                if sides.turns % 2:
+                    frame = replace(frame, mirrored=not frame.mirrored)
             sound.append(frame)
         node.frames[:] = sound
-        return decoded, swapped
-
-
-def _set_property(node: OniNode, record: Record) -> None:
-    name, value = parse_property(record)
-    if len(value) != _SIZES.get(name, len(value)):
-        raise RecordError(f"the property {name} has {len(value)} bytes, not {_SIZES[name]}")
-    node.properties[name] = (record.kind, value)
+        return decoded, swapped, notes

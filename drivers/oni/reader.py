@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import BinaryIO
 
-from selective_depth.drivers.errors import DamagedRecordingError, SourceEndedError
-from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.errors import DamagedRecordingError, SourceEndedError, SourceError
+from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
 from selective_depth.drivers.oni.codec import decode_depth
 from selective_depth.drivers.oni.files import open_regular, read_payload
+from selective_depth.drivers.oni.form import Sides, turned_at, upright
 from selective_depth.drivers.oni.inspection import inspect_oni
 from selective_depth.drivers.oni.report import OniFrame, OniReport
 from selective_depth.drivers.source import DepthSource
@@ -25,6 +26,10 @@ class OniReader(DepthSource):
     ----------
     path : str or Path
         The recording.
+    stream : int, default 1
+        Which depth stream, from 1.
+    intrinsics : (float, float, float, float), optional
+        fx, fy, cx, cy in pixels; default from the recorded field of view.
 
     Attributes
     ----------
@@ -41,24 +46,35 @@ class OniReader(DepthSource):
 
     live = False
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        stream: int = 1,
+        intrinsics: tuple[float, ...] | None = None,
+    ) -> None:
         self.uri = str(path)
-        self.report = inspect_oni(path)
+        self.report = inspect_oni(path, stream=stream)
         self.dropped = 0
+        if self.report.unsupported:
+            raise SourceError(f"'{path}' cannot be read: {self.report.unsupported}.")
         if self.report.problems:
             self.notes = (
                 f"'{path}' is not whole ({self.report.problems[0]}); `selective-depth check` says"
                 " more, and saves what can be saved with --repair.",
             )
+        self.notes += tuple(f"'{path}': {note}." for note in self.report.notes)
         self._frames, self._damage = _trusted_frames(self.report)
         if self._damage is not None and not self._frames:
             raise DamagedRecordingError(self._sentence(self._damage))
         if not self._frames or self.report.depth is None or self.report.camera is None:
             raise DamagedRecordingError(f"'{path}' holds no depth frames; was it ever recorded to?")
-        self.camera = self.report.camera
+        self.camera = camera = self.report.camera
+        if intrinsics is not None:
+            self.camera = Camera(camera.width, camera.height, *intrinsics)
         self.fps = self.report.fps
         self.frame_count = len(self._frames)
-        self._codec = self.report.depth.codec
+        self._sides = Sides()
         self._next = 0
         self._file: BinaryIO | None = open_regular(self.report.path)
 
@@ -80,9 +96,12 @@ class OniReader(DepthSource):
                 raise DamagedRecordingError(self._sentence(self._damage))
             raise SourceEndedError(f"'{self.uri}' has ended after {self._next} frames.")
         frame = self._frames[self._next]
-        depth_mm = decode_depth(
-            self._codec, read_payload(self._file, frame), self.camera.height, self.camera.width
-        )
+        depth_mm = read_depth(self.report, self._file, frame)
+        if depth_mm is not None:
+            turns = self._sides.turns
+            depth_mm = self._sides.put_right(depth_mm)
+            if not turns and self._sides.turns:
+                self.notes += (f"'{self.uri}' {turned_at(frame.number)}",)
         if depth_mm is None:
             self._frames = self._frames[: self._next]
             self._damage = f"byte {frame.record_offset}: frame {frame.number} cannot be decoded"
@@ -102,6 +121,14 @@ class OniReader(DepthSource):
         count = len(self._frames)
         what = f"cannot be read beyond frame {count}" if count else "has no readable frame"
         return f"'{self.uri}' {what} ({damage}). `selective-depth check` says what can be saved."
+
+
+def read_depth(report: OniReport, file: BinaryIO, frame: OniFrame) -> DepthArray | None:
+    """A frame of a report's depth in millimetres and the right way round; None if damaged."""
+    assert report.depth is not None and report.camera is not None
+    payload = read_payload(file, frame)
+    raw = decode_depth(report.depth.codec, payload, report.camera.height, report.camera.width)
+    return None if raw is None else upright(raw, report.tenths, frame.mirrored)
 
 
 def _trusted_frames(report: OniReport) -> tuple[list[OniFrame], str | None]:

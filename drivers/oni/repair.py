@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
-
 from selective_depth.drivers.errors import DamagedRecordingError, OutputError
 from selective_depth.drivers.folder import FolderWriter
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.oni.codec import decode_depth, mend_order
+from selective_depth.drivers.oni.codec import encode_depth, mend_order
 from selective_depth.drivers.oni.files import open_regular, read_payload
 from selective_depth.drivers.oni.inspection import inspect_oni
+from selective_depth.drivers.oni.reader import read_depth
 from selective_depth.drivers.oni.records import CODEC_TABLE, CODECS, NodeAddition
 from selective_depth.drivers.oni.report import OniFrame, OniReport
 from selective_depth.drivers.oni.writer import RecordWriter, depth_properties
@@ -24,9 +22,9 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
     """Write what is readable of an .oni file to a new one that OpenNI2 replays.
 
     Every stream is kept, compressed as it was; frames that are damaged are left out and the rest
-    numbered anew; times that run backwards are interpolated; last pixels that OpenNI2's recorder
-    swapped are put right (see `mend_oni`). A file whose recorder was killed
-    comes back whole.
+    numbered anew; times go on rising; depth that is mirrored, cropped or in other units is written
+    as it is delivered; last pixels that OpenNI2's recorder swapped are put right (see
+    `codec`). A file whose recorder was killed comes back whole.
 
     Parameters
     ----------
@@ -55,22 +53,27 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
     with open_regular(report.path) as file:
         writer = RecordWriter(Path(out_path))
         try:
-            frames: list[tuple[int, OniFrame, int]] = []
+            frames: list[tuple[int, OniFrame]] = []
             for node in report.nodes:
                 if node.is_stream and not (node.ready and node.codec in CODECS):
                     continue
                 known = defaults if node is report.depth else {}
                 properties = {**known, **node.properties}
+                if node is report.depth and not report.as_stored:
+                    properties = known  # it is written as it is delivered
                 addition = NodeAddition(node.name, node.node_type, node.codec, None, 0)
                 writer.add_node(node.number, addition, properties)
-                times_us = _mended_times(node.frames)
-                frames += [(node.number, *item) for item in zip(node.frames, times_us, strict=True)]
+                frames += [(node.number, frame) for frame in node.frames]
             writer.begin()
-            for number, frame, time_us in sorted(frames, key=lambda item: item[1].record_offset):
+            for number, frame in sorted(frames, key=lambda item: item[1].record_offset):
                 payload = read_payload(file, frame)
-                if number == report.depth.number:
+                if number == report.depth.number and not report.as_stored:
+                    depth_mm = read_depth(report, file, frame)
+                    assert depth_mm is not None  # decoded a moment ago
+                    payload = encode_depth(depth_mm)
+                elif number == report.depth.number:
                     payload = _mended_payload(report, payload) or payload
-                writer.add_frame(number, time_us, payload)
+                writer.add_frame(number, frame.timestamp_us, payload)
         finally:
             writer.close()
     return inspect_oni(out_path, decode=True, timeout_s=float("inf"))
@@ -151,45 +154,14 @@ def export_oni(
     depth, camera = report.depth, report.camera
     assert depth is not None and camera is not None
     with open_regular(report.path) as file, FolderWriter(folder, fps=report.fps) as out:
-        times_us = _mended_times(depth.frames)
-        pairs = zip(depth.frames, times_us, strict=True)
-        for index, (frame, time_us) in enumerate(islice(pairs, frames)):
-            depth_mm = decode_depth(
-                depth.codec, read_payload(file, frame), camera.height, camera.width
-            )
+        for index, frame in enumerate(islice(depth.frames, frames)):
+            depth_mm = read_depth(report, file, frame)
             if depth_mm is None:
                 raise DamagedRecordingError(f"'{path}' has changed while it was read.")
-            out.write(DepthFrame(depth_mm, index, time_us, camera, str(path)))
+            out.write(DepthFrame(depth_mm, index, frame.timestamp_us, camera, str(path)))
             if progress is not None:
                 progress(index + 1)
     return report
-
-
-def _mended_times(frames: list[OniFrame]) -> list[int]:
-    """Timestamps that never run backwards: the few that break the order are interpolated.
-
-    Kept is the longest increasing sequence among them, so that one wild value does not count as
-    many old ones.
-    """
-    ends: list[int] = []  # smallest last value of an increasing sequence of each length
-    at: list[int] = []  # and where it stands
-    before: list[int] = []
-    for index, frame in enumerate(frames):
-        length = bisect_right(ends, frame.timestamp_us)
-        before.append(at[length - 1] if length else -1)
-        ends[length:] = [frame.timestamp_us, *ends[length + 1 :]]
-        at[length:] = [index, *at[length + 1 :]]
-    kept = []
-    index = at[-1] if at else -1
-    while index >= 0:
-        kept.append(index)
-        index = before[index]
-    kept.reverse()
-    if len(kept) == len(frames):
-        return [frame.timestamp_us for frame in frames]
-    first_us = frames[kept[0]].timestamp_us  # floating point is exact for what is left
-    since_us = [frames[index].timestamp_us - first_us for index in kept]
-    return [first_us + round(us) for us in np.interp(range(len(frames)), kept, since_us)]
 
 
 def _mended_payload(report: OniReport, payload: bytes) -> bytes | None:

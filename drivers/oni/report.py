@@ -44,6 +44,7 @@ class OniFrame:
     record_offset: int
     payload_offset: int
     payload_size: int
+    mirrored: bool = False
 
 
 @dataclass
@@ -62,6 +63,7 @@ class OniNode:
     ready: bool = False
     removed: bool = False
     has_seek_table: bool = False
+    changed: bool = False
 
     @property
     def is_stream(self) -> bool:
@@ -100,6 +102,12 @@ class OniReport:
         frame size is unknown.
     fps : float
         Recorded frame rate.
+    tenths : bool
+        True if the stored depth is in tenths of millimetres.
+    unsupported : str
+        Why a file that is in order cannot be read; empty if it can.
+    notes : tuple of str
+        What is done to the frames, or else worth knowing, though nothing is wrong.
     problems : tuple of OniProblem
         By offset; empty if nothing is wrong.
     ended : bool
@@ -122,6 +130,9 @@ class OniReport:
     depth: OniNode | None
     camera: Camera | None
     fps: float
+    tenths: bool
+    unsupported: str
+    notes: tuple[str, ...]
     problems: tuple[OniProblem, ...]
     ended: bool
     tail_bytes: int
@@ -138,6 +149,13 @@ class OniReport:
     def complete(self) -> bool:
         """True if nothing is wrong with the file."""
         return self.ended and not self.problems and self.readable_frames > 0
+
+    @property
+    def as_stored(self) -> bool:
+        """True if frames are delivered as they are stored: same side, unit and size."""
+        frames = self.depth.frames if self.depth is not None else []
+        crop = (self.depth.values_of("xnCropping", "<IHHHH") if self.depth else None) or (0,)
+        return not (self.tenths or crop[0] or any(frame.mirrored for frame in frames))
 
     @property
     def openable(self) -> bool:

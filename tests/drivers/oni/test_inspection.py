@@ -432,7 +432,7 @@ def test_every_wrong_number_is_found_and_named(
         ("xnMapOutputMode", b"short", "has 5 bytes, not 12"),
         ("xnMapOutputMode", None, "frame size is not recorded"),
         ("xnCropping", None, "would deliver no frame at all"),
-        ("xnCropping", struct.pack("<IHHHH", 1, 0, 0, 8, 8), "cropped"),
+        ("xnCropping", struct.pack("<IHHHH", 1, 79, 0, 8, 8), "cannot be cropped"),
         ("xnFOV", struct.pack("<dd", float("nan"), 0.7), "field of view is wrong: "),
         ("oniRequiredFrameSize", (5).to_bytes(8, "little"), "do not have 5 bytes"),
         ("xnDeviceMaxDepth", (0).to_bytes(8, "little"), "largest depth cannot be 0"),
