@@ -167,9 +167,7 @@ def check(
     (f"{PROGRAM} export frames/ walk.oni", "an .oni file out of PNG files"),
     (f"{PROGRAM} export virtual:ball ball.oni --frames 90", "of any source"),
 )
-def export(
-    source: Source, out: Annotated[Path, arg(metavar="OUT")], /, frames: Limit = None
-) -> int:
+def export(source: Source, out: Annotated[Path, arg(metavar="OUT")], /, frames: Limit = None) -> int:
     """Save the frames of a source as PNG files, or as an .oni file; needs no OpenNI2.
 
     Parameters
@@ -187,8 +185,7 @@ def export(
 
 
 @command(
-    "Files",
-    (f"{PROGRAM} model frames/ model --frame 30 --budget 0.05", "a cloud, its depth, its samples"),
+    "Files", (f"{PROGRAM} model frames/ model --frame 30 --budget 0.05", "a cloud, its depth, its samples")
 )
 def model(
     source: Source,
@@ -219,10 +216,7 @@ def model(
     return model_frame(source, out, frame, settings)
 
 
-@command(
-    "Pictures",
-    (f"{PROGRAM} screenshot out.rrd out.png", "the viewer on a recording that --save wrote"),
-)
+@command("Pictures", (f"{PROGRAM} screenshot out.rrd out.png", "the viewer on a recording that --save wrote"))
 def screenshot(
     recording: Annotated[Path, arg(metavar="FILE.rrd")],
     picture: Annotated[Path, arg(metavar="FILE.png")],

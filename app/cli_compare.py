@@ -26,12 +26,7 @@ SourceOrSample = Annotated[str | None, optional("SOURCE")]
 Page = Annotated[PictureOptions, arg(name="")]
 Files = Annotated[EvaluationFiles, arg(name="")]
 Compared = Annotated[ComparisonOptions, arg(name="")]
-PAGE, FILES, COMPARED, DEFAULTS = (
-    PictureOptions(),
-    EvaluationFiles(),
-    ComparisonOptions(),
-    Settings(),
-)
+PAGE, FILES, COMPARED, DEFAULTS = (PictureOptions(), EvaluationFiles(), ComparisonOptions(), Settings())
 
 
 @command(

@@ -72,16 +72,12 @@ def _share(typed: str) -> float:
     return float(typed[:-1]) / 100 if typed.endswith("%") else float(typed)
 
 
-Share = Annotated[
-    float, must_be("a share between 0 and 1, or of 100%", _share, lambda x: 0 <= x <= 1)
-]
+Share = Annotated[float, must_be("a share between 0 and 1, or of 100%", _share, lambda x: 0 <= x <= 1)]
 positive = must_be("more than 0", float, lambda x: 0 < x < float("inf"))
 Positive = Annotated[float, positive]
 TimeLimit = Annotated[float | None, positive, optional("SECONDS")]
 _SIZE = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%")
-Memory = Annotated[
-    str, must_be("a size, such as 256MiB or 25%", str, _SIZE.fullmatch), arg(metavar="SIZE")
-]
+Memory = Annotated[str, must_be("a size, such as 256MiB or 25%", str, _SIZE.fullmatch), arg(metavar="SIZE")]
 Millimetres = Annotated[int | None, whole(0, 65535), optional("MM")]
 
 
@@ -121,9 +117,7 @@ class ImprovementOptions:
 
     share: Share = 0.10
     """Share of the known pixels that the mask selects."""
-    exponent: Annotated[
-        float, must_be("more than 0, at most 1.9999", float, lambda w: 0 < w <= 1.9999)
-    ] = 1.2
+    exponent: Annotated[float, must_be("more than 0, at most 1.9999", float, lambda w: 0 < w <= 1.9999)] = 1.2
     """Exponent w = 2 - epsilon of the semivariogram, eq. (24)."""
     formula: Literal["eq23", "eq27"] = "eq23"
     """Eq. (23), or eq. (27), which holds for exponents near 2: sums over each neighbourhood."""

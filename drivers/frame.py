@@ -48,9 +48,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
-            raise ValueError(
-                f"camera size is {self.width}x{self.height} pixels; both must be at least 1"
-            )
+            raise ValueError(f"camera size is {self.width}x{self.height} pixels; both must be at least 1")
         for name in ("fx", "fy"):
             if not LEAST_FOCAL_PX <= getattr(self, name) <= MOST_PX:
                 raise ValueError(
@@ -171,13 +169,9 @@ class DepthFrame:
         shape = getattr(depth, "shape", ())
         unsigned_16 = isinstance(kind, np.dtype) and kind.kind == "u" and kind.itemsize == 2
         if not unsigned_16 or len(shape) != 2:
-            raise ValueError(
-                f"depth_mm must be a uint16 array of shape (height, width), got {kind} {shape}"
-            )
+            raise ValueError(f"depth_mm must be a uint16 array of shape (height, width), got {kind} {shape}")
         if not -MOST_TIME_US <= self.timestamp_us <= MOST_TIME_US:
-            raise ValueError(
-                f"timestamp_us is {self.timestamp_us}; it must lie within {MOST_TIME_US} of 0"
-            )
+            raise ValueError(f"timestamp_us is {self.timestamp_us}; it must lie within {MOST_TIME_US} of 0")
         if depth.shape != (self.camera.height, self.camera.width):
             raise ValueError(
                 f"depth_mm has shape {depth.shape}, but the camera is {self.camera.height} rows"

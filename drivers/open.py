@@ -9,8 +9,7 @@ from selective_depth.drivers.options import Options
 from selective_depth.drivers.source import DepthSource
 
 _WHAT_THERE_IS = (
-    "Give an .oni file, a folder of 16-bit PNG frames, 'openni' for a sensor, or"
-    " 'virtual:workstation'."
+    "Give an .oni file, a folder of 16-bit PNG frames, 'openni' for a sensor, or 'virtual:workstation'."
 )
 
 
@@ -59,9 +58,7 @@ def open_source(uri: str | Path) -> DepthSource:
         scale = options.numbers("scale", "values per metre", 1e-2, 1e6)
         intrinsics = options.camera()
         options.done()
-        return RecordedFolder(
-            path, values_per_metre=scale[0] if scale else None, intrinsics=intrinsics
-        )
+        return RecordedFolder(path, values_per_metre=scale[0] if scale else None, intrinsics=intrinsics)
     if suffix == ".oni":
         from selective_depth.drivers.oni import OniReader
 

@@ -54,8 +54,7 @@ def warn_of_metres(given: npt.ArrayLike, mm: npt.NDArray[np.float32], name: str)
     farthest = float(mm.max(initial=0))
     if np.ma.getdata(given).dtype.kind == "f" and 0 < farthest < _METRES:
         warnings.warn(
-            f"the greatest depth in {name} is {farthest:g} mm; if these are metres, multiply by"
-            " 1000",
+            f"the greatest depth in {name} is {farthest:g} mm; if these are metres, multiply by 1000",
             stacklevel=3,
         )
 
@@ -73,8 +72,7 @@ def pixels_in(uv: npt.ArrayLike, shape: tuple[int, int], name: str = "uv") -> np
     height, width = shape
     if given.ndim != 2 or given.shape[1] != 2 or (given.dtype.kind not in "ui" and given.size):
         raise ValueError(
-            f"{name} must be whole numbers of shape (n, 2), column first, got {given.dtype}"
-            f" {given.shape}"
+            f"{name} must be whole numbers of shape (n, 2), column first, got {given.dtype} {given.shape}"
         )
     if np.ma.getmask(uv).any():
         raise ValueError(f"{name} has masked elements; leave out the pixels that are not meant")
@@ -103,9 +101,7 @@ def sample_pairs(
     return pixels, mm
 
 
-def checked_map(
-    values: npt.ArrayLike, shape: tuple[int, int], name: str
-) -> npt.NDArray[np.float32]:
+def checked_map(values: npt.ArrayLike, shape: tuple[int, int], name: str) -> npt.NDArray[np.float32]:
     """A worth for every pixel of a frame, float32, 0 where it is masked, negative or no number.
 
     Raises
@@ -116,8 +112,7 @@ def checked_map(
     given = np.ma.getdata(values)
     if given.shape != shape or given.dtype.kind not in "buif":
         raise ValueError(
-            f"{name} must be a number for every pixel, of shape {shape}, got {given.dtype}"
-            f" {given.shape}"
+            f"{name} must be a number for every pixel, of shape {shape}, got {given.dtype} {given.shape}"
         )
     greatest = np.finfo(np.float32).max
     with np.errstate(over="ignore"):

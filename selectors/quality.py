@@ -74,6 +74,4 @@ def errors_of(model_mm: npt.NDArray[np.floating], truth_mm: npt.ArrayLike) -> Mo
     known_mm = truth[valid].astype(np.float64)
     error_mm = np.abs(model[valid] - known_mm)
     wrong = error_mm > np.maximum(WRONG_MM, WRONG_SHARE * known_mm)
-    return ModelErrors(
-        float(np.sqrt(np.mean(error_mm**2))), float(np.mean(error_mm)), float(np.mean(wrong))
-    )
+    return ModelErrors(float(np.sqrt(np.mean(error_mm**2))), float(np.mean(error_mm)), float(np.mean(wrong)))

@@ -17,11 +17,7 @@ from selective_depth.selectors.triangulation import Surface
 
 
 def reconstruct(
-    uv: npt.ArrayLike,
-    depth_mm: npt.ArrayLike,
-    shape: tuple[int, int],
-    *,
-    threads: int | None = None,
+    uv: npt.ArrayLike, depth_mm: npt.ArrayLike, shape: tuple[int, int], *, threads: int | None = None
 ) -> npt.NDArray[np.float32]:
     """Dense depth from samples: linear on Delaunay triangles, without bridging depth steps.
 

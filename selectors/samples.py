@@ -122,9 +122,7 @@ class Samples:
         self._added.append((pixels, mm))
         _record(pixels, mm, self.image_mm, self.bits)
 
-    def added_since(
-        self, addition: int
-    ) -> Iterator[tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]]:
+    def added_since(self, addition: int) -> Iterator[tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]]:
         """Pixels and depths (0 = no return) of every addition after one of that number."""
         return iter(self._added[addition:])
 

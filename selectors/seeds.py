@@ -24,9 +24,7 @@ def cell_centres(pixels: int, cells: int, name: str = "seeds") -> npt.NDArray[np
     not fit, the error calls them by `name`.
     """
     if not 1 <= cells <= pixels:
-        raise ValueError(
-            f"{cells} {name} do not fit on {pixels} pixels; give between 1 and {pixels}"
-        )
+        raise ValueError(f"{cells} {name} do not fit on {pixels} pixels; give between 1 and {pixels}")
     return ((2 * np.arange(cells, dtype=np.int64) + 1) * pixels // (2 * cells)).astype(np.int32)
 
 
@@ -109,9 +107,7 @@ class SeedGrid:
         given = None
         if points_mm is not None:
             if np.shape(points_mm) != (height, width, 3):
-                raise ValueError(
-                    f"points_mm must have shape {(height, width, 3)}, got {np.shape(points_mm)}"
-                )
+                raise ValueError(f"points_mm must have shape {(height, width, 3)}, got {np.shape(points_mm)}")
             points = np.ma.filled(np.ma.asarray(points_mm)[cells].astype(np.float32), np.nan)
             given = np.ascontiguousarray(points)
             given[seeds_mm == 0] = np.nan

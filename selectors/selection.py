@@ -60,13 +60,11 @@ class Selection:
     def __post_init__(self) -> None:
         if self.mask.dtype != np.bool_ or self.mask.ndim != 2:
             raise ValueError(
-                f"mask must be bool of shape (height, width), got {self.mask.dtype}"
-                f" {self.mask.shape}"
+                f"mask must be bool of shape (height, width), got {self.mask.dtype} {self.mask.shape}"
             )
         if self.score.dtype != np.float32 or self.score.shape != self.mask.shape:
             raise ValueError(
-                f"score must be float32 of shape {self.mask.shape}, got {self.score.dtype}"
-                f" {self.score.shape}"
+                f"score must be float32 of shape {self.mask.shape}, got {self.score.dtype} {self.score.shape}"
             )
 
     @property

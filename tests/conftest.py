@@ -44,9 +44,7 @@ def virtual_driver() -> Path:
 
 
 @pytest.fixture
-def virtual_sensor(
-    virtual_driver: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> VirtualSensor:
+def virtual_sensor(virtual_driver: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> VirtualSensor:
     """A sensor attached to this process's OpenNI2, which sees no other.
 
     Its frame k (from 0, round and round after 20) is k + 1 on the right and k + 1001 on the left.

@@ -66,7 +66,5 @@ def reference_system(system: LocalSystem, at, w: float) -> tuple[float, float, f
     _, z, variance = krige(system.uv, system.depth_mm, at[None], a, b, w)
     if constant:
         return max(float(z[0]), floor), 0.0, 0.0
-    improvement = direct_improvement(
-        system.uv, system.depth_mm, at, system.neighbours_uv, a, b, w, floor
-    )
+    improvement = direct_improvement(system.uv, system.depth_mm, at, system.neighbours_uv, a, b, w, floor)
     return max(float(z[0]), floor), float(variance[0]), improvement

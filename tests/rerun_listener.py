@@ -33,9 +33,7 @@ class Listener:
         assert executable is not None
         serve = ["--serve-grpc", "--bind", "127.0.0.1", "--port", str(self.port)]
         self.process = subprocess.Popen(
-            [executable, *self._follow, *serve],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+            [executable, *self._follow, *serve], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         deadline_s = time.monotonic() + 10
         while not window.listens(("127.0.0.1", self.port)):

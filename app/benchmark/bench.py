@@ -22,12 +22,7 @@ from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline import RunReport, StageSummary, open_and_tell
 from selective_depth.app.settings import RunOptions, Settings, ViewerOptions
 from selective_depth.selectors.improvement import ImprovementSelector
-from selective_depth.selectors.neural_gas import (
-    BatchNeuralGas,
-    delaunay_regions,
-    node_pixels,
-    train_exact,
-)
+from selective_depth.selectors.neural_gas import BatchNeuralGas, delaunay_regions, node_pixels, train_exact
 from selective_depth.selectors.parallel import default_threads
 from selective_depth.selectors.seeds import SeedGrid
 
@@ -153,9 +148,7 @@ def _seeds_of(source: str, frames: int | None) -> list[SeedGrid]:
     seeds = []
     with open_and_tell(source) as opened:
         if opened.frame_count is None and frames is None:
-            raise UsageError(
-                f"'{source}' never ends; say how many frames to time, as in --frames 300."
-            )
+            raise UsageError(f"'{source}' never ends; say how many frames to time, as in --frames 300.")
         for frame in opened:
             seeds.append(SeedGrid.from_frame(frame))
             if frames is not None and len(seeds) >= frames:

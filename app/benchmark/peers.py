@@ -41,9 +41,7 @@ def krigekit_seconds(seeds: SeedGrid) -> float:
     depth_mm = seeds.depth_mm[seeds.valid].astype(np.float64)
     structure = {"vtype": "sph", "nugget": 100.0, "sill": 1e5, "a_major": 200.0}
     start = time.perf_counter()
-    ordinary_kriging(
-        known, depth_mm, pixel_centres(seeds.frame_shape), vgm_spec=structure, nmax=NEIGHBOURS
-    )
+    ordinary_kriging(known, depth_mm, pixel_centres(seeds.frame_shape), vgm_spec=structure, nmax=NEIGHBOURS)
     return time.perf_counter() - start
 
 

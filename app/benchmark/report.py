@@ -47,9 +47,7 @@ ratios vary less.
 """
 
 
-def run_bench(
-    source: str, frames: int | None, *, json: Path | None, page: Path | None, peers: bool
-) -> None:
+def run_bench(source: str, frames: int | None, *, json: Path | None, page: Path | None, peers: bool) -> None:
     """Measure, print the tables, and write the files that were asked for.
 
     Raises
@@ -95,8 +93,7 @@ def print_bench(report: BenchReport) -> None:
 def to_page(report: BenchReport) -> str:
     """The benchmark page of the documentation, in Markdown."""
     stages = "\n".join(
-        f"| `{name}` | {each.p50_ms:,.2f} | {each.p99_ms:,.2f} | {each.max_ms:,.2f} |"
-        f" {each.count:,} |"
+        f"| `{name}` | {each.p50_ms:,.2f} | {each.p99_ms:,.2f} | {each.max_ms:,.2f} | {each.count:,} |"
         for name, each in report.stages.items()
     )
     peers = "\n".join(

@@ -70,9 +70,7 @@ def object_seeds(frame: DepthFrame, points: int) -> SeedGrid:
     """
     height, width = frame.shape
     spacing = np.sqrt(np.count_nonzero(frame.depth_mm) / points)
-    rows, columns = (
-        int(np.clip(round(side / max(spacing, 1)), 1, side)) for side in (height, width)
-    )
+    rows, columns = (int(np.clip(round(side / max(spacing, 1)), 1, side)) for side in (height, width))
     return SeedGrid.from_frame(frame, (rows, columns))
 
 
@@ -188,13 +186,7 @@ def _figure(
     """The object, then a column per training: nodes above, kept triangles by each metric below."""
     first = shaded_panel(frame, "Object", note)
     nodes = [
-        Panel(
-            "nodes",
-            title,
-            backdrop(frame),
-            note=words,
-            overlay=partial(draw_nodes, regions=by["3d"]),
-        )
+        Panel("nodes", title, backdrop(frame), note=words, overlay=partial(draw_nodes, regions=by["3d"]))
         for title, words, by in columns
     ]
     rows: list[Row] = [("Nodes of the neural gas", [first, *nodes])]

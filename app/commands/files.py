@@ -100,9 +100,7 @@ def export(source: str, out: Path, frames: int | None) -> int:
     return OK
 
 
-def _save(
-    source: DepthSource, out: Path, to_oni: bool, frames: int | None, progress: FrameProgress
-) -> int:
+def _save(source: DepthSource, out: Path, to_oni: bool, frames: int | None, progress: FrameProgress) -> int:
     writer = OniWriter(out, fps=source.fps) if to_oni else FolderWriter(out, fps=source.fps)
     count = 0
     with writer:

@@ -105,10 +105,7 @@ def save_samples(path: Path, acquisition: Acquisition) -> None:
 
 
 def save_model(
-    folder: Path,
-    acquisition: Acquisition,
-    camera: Camera,
-    depth_mm: npt.NDArray[np.floating] | None = None,
+    folder: Path, acquisition: Acquisition, camera: Camera, depth_mm: npt.NDArray[np.floating] | None = None
 ) -> list[Path]:
     """Write ``cloud.ply``, ``depth.png`` and ``samples.npz`` into a folder, made if missing.
 

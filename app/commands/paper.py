@@ -50,9 +50,7 @@ def draw_figure(
     if number == 1:
         return draw_epochs(sources[0], path, save=None, number=frame, seed=gas.seed, page=page)
     if number == 2:
-        return draw_densities(
-            sources[0], path, number=frame, epochs=gas.epochs, seed=gas.seed, page=page
-        )
+        return draw_densities(sources[0], path, number=frame, epochs=gas.epochs, seed=gas.seed, page=page)
     if number == 4:
         frames = [nth_frame(uri, frame) for uri in sources]
         rows = [

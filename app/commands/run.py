@@ -200,9 +200,7 @@ class Session:
         spend = self.settings.acquire
         return f"by {spend.by}" if spend.budget else ""
 
-    def _flow(
-        self, source: DepthSource, pipeline: Pipeline, viewer: Viewer, progress: FrameProgress
-    ) -> None:
+    def _flow(self, source: DepthSource, pipeline: Pipeline, viewer: Viewer, progress: FrameProgress) -> None:
         """Source to pipeline to result to sinks, one frame after the other."""
         feed = Feed(source, self.settings.run.frames)
         state, taken = state_of(source), 0
@@ -244,9 +242,7 @@ class Session:
         self._recent_s.append(self._ready_s)
         log.info("ready after %.1f s", self._ready_s - began_s)
 
-    def _show(
-        self, result: FrameResult, source: DepthSource, pipeline: Pipeline, viewer: Viewer
-    ) -> None:
+    def _show(self, result: FrameResult, source: DepthSource, pipeline: Pipeline, viewer: Viewer) -> None:
         """Add what only the run knows of a result, and hand it to report and viewer."""
         now_s = time.monotonic()
         self._recent_s.append(now_s)

@@ -66,12 +66,7 @@ def record_sensor(
     interrupt.allow(interrupt.SAVE_S)
     with FrameProgress(f"Recording {out}", frames) as progress:
         report = record_oni(
-            out,
-            device,
-            frames=frames,
-            duration_s=seconds,
-            progress=progress.update,
-            overwrite=overwrite,
+            out, device, frames=frames, duration_s=seconds, progress=progress.update, overwrite=overwrite
         )
     say(f"wrote {out}: {report.frames} frames, read back; it took {report.seconds:.1f} s")
     if report.problem:

@@ -8,13 +8,7 @@ from pathlib import Path
 
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import OK
-from selective_depth.app.console.output import (
-    IMAGES,
-    check_picture,
-    is_picture,
-    make_folder,
-    write_image,
-)
+from selective_depth.app.console.output import IMAGES, check_picture, is_picture, make_folder, write_image
 from selective_depth.app.console.progress import waiting
 from selective_depth.app.pictures import StillRow, alone, contact_sheet, panels_of, write_picture
 from selective_depth.app.pipeline import Pipeline, open_and_tell, say

@@ -24,9 +24,7 @@ LEAVE_S = 2.8
 SAVE_S = 15.0
 """The same while a recording is being written, which must not be cut off."""
 
-SIGNALS = [
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-]
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 """What ends a run in good order; Windows has no SIGHUP."""
 
 _asked = threading.Event()

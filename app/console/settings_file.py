@@ -79,9 +79,7 @@ def settings_arguments(path: Path, defaults: dict[str, Any]) -> list[str]:
         name = option.rpartition(".")[2].removeprefix("--")
         if name == "save" and _is_of(path, Path(str(value))):
             continue  # written by an earlier version; this run is not to replace that recording
-        if (name in flags) != isinstance(value, bool) or (
-            isinstance(value, list) and name not in lists
-        ):
+        if (name in flags) != isinstance(value, bool) or (isinstance(value, list) and name not in lists):
             kind = "true or false" if name in flags else "a single value, not true, false or a list"
             raise UsageError(f"{option} is {value!r} in '{path}'; it must be {kind}.")
         if isinstance(value, list):
@@ -110,10 +108,7 @@ def preset_arguments(name: str, defaults: dict[str, Any]) -> list[str]:
     """
     if name not in PRESETS:
         raise UsageError(f"--preset is '{name}'; there is {' and '.join(PRESETS)}.")
-    taken = {
-        *defaults,
-        *(key for value in defaults.values() for key in getattr(value, "__dict__", ())),
-    }
+    taken = {*defaults, *(key for value in defaults.values() for key in getattr(value, "__dict__", ()))}
     sections = {key: value for key, value in PRESETS[name].items() if key in taken}
     if not sections:
         raise UsageError(f"--preset {name} sets none of this command's options; leave it out.")

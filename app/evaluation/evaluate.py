@@ -124,9 +124,7 @@ def _evaluate_frame(
                 run_strategy(name, Case(frame, seeds_shape, shots, rounds, seed, settings))
                 for seed in range(draws)
             )
-            outcomes.append(
-                Outcome(label, budget, name, errors, frame.source, frame.index, measured)
-            )
+            outcomes.append(Outcome(label, budget, name, errors, frame.source, frame.index, measured))
     return outcomes
 
 
@@ -296,12 +294,7 @@ def _spread(
 
 
 def _check(
-    every: int,
-    frames: int | None,
-    budgets: Sequence[float],
-    rounds: int,
-    random_seeds: int,
-    jobs: int | None,
+    every: int, frames: int | None, budgets: Sequence[float], rounds: int, random_seeds: int, jobs: int | None
 ) -> None:
     if not budgets:
         raise UsageError("--budget names no share; give one or more, such as 0.05 0.10.")
@@ -316,8 +309,7 @@ def _check(
     for budget in budgets:
         if not 0 < budget <= 1:
             raise UsageError(
-                f"--budget is {budget}; it is a share of the frame's pixels between 0 and 1,"
-                " such as 0.05."
+                f"--budget is {budget}; it is a share of the frame's pixels between 0 and 1, such as 0.05."
             )
 
 

@@ -131,15 +131,12 @@ def curves(found: Sequence[Outcome], width_in: float) -> Figure:
     results = summarise(found)
     measured = {f"{o.budget:g}": 100 * o.measured for o in found}
     with rc_context({"text.parse_math": False, "font.size": 11 * width_in / 16 + 2}):
-        figure = Figure(
-            figsize=(width_in, width_in * 0.56), facecolor="white", layout="constrained"
-        )
+        figure = Figure(figsize=(width_in, width_in * 0.56), facecolor="white", layout="constrained")
         axes = figure.add_subplot()
         names = list(next(iter(results.values())))
         for at, name in enumerate(n for n in names if not strategy_of(n).reference):
             points = [
-                (measured[f"{float(budget):g}"], table[name]["rmse_mm"])
-                for budget, table in results.items()
+                (measured[f"{float(budget):g}"], table[name]["rmse_mm"]) for budget, table in results.items()
             ]
             style = ("-", "--", ":", "-.")[at // 10 % 4]
             bold = 3.0 if name == "loop" else 1.4

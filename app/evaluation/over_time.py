@@ -128,11 +128,7 @@ def over_time(
         scored &= (frame.depth_mm > 0) if often is None else often
         if memory is None:
             memory = TemporalAcquisition(
-                frame.shape,
-                budget=budget,
-                first_budget=FIRST_BUDGET,
-                seeds=seeds_shape,
-                rounds=rounds,
+                frame.shape, budget=budget, first_budget=FIRST_BUDGET, seeds=seeds_shape, rounds=rounds
             )
         step = memory.step(frame.measure)
         courses["memory"].add(step.model_mm, truth, scored)
@@ -189,8 +185,7 @@ def run_over_time(
     if files.json is not None:
         document = {
             "over_time": {
-                uri: {way: asdict(course) for way, course in ways.items()}
-                for uri, ways in found.items()
+                uri: {way: asdict(course) for way, course in ways.items()} for uri, ways in found.items()
             },
             "budget": options.budget[0],
         }

@@ -21,12 +21,7 @@ from selective_depth.app.pictures import Panel, sheet, write_picture
 from selective_depth.app.pictures.panels import error_panel, shots_panel
 from selective_depth.app.pictures.sheets import WIDTH_IN
 from selective_depth.app.pipeline import say
-from selective_depth.app.settings import (
-    ComparisonOptions,
-    EvaluationFiles,
-    PictureOptions,
-    Settings,
-)
+from selective_depth.app.settings import ComparisonOptions, EvaluationFiles, PictureOptions, Settings
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.reconstruct import reconstruct
@@ -98,9 +93,7 @@ def run_evaluation(
         write_output(files.page, to_markdown(found))
     if files.picture is not None:
         frame = next(frames_of(sources, options.every, 1))
-        shown = comparison(
-            frame, budgets[0], rounds=rounds, seeds_shape=seeds_shape, width_in=page.width
-        )
+        shown = comparison(frame, budgets[0], rounds=rounds, seeds_shape=seeds_shape, width_in=page.width)
         write_picture(files.picture, shown, page.dpi)
     if files.curves is not None:
         write_picture(files.curves, curves(found, page.width), page.dpi)
@@ -119,8 +112,7 @@ def print_results(results: Results, frames: int, rounds: int) -> None:
     console = Console(highlight=False, no_color=not colours())
     for budget, table in results.items():
         shown = Table(
-            title=f"+{_percent(budget)} of the pixels · {frames} frames"
-            f" · closed loops of {rounds} rounds",
+            title=f"+{_percent(budget)} of the pixels · {frames} frames · closed loops of {rounds} rounds",
             title_justify="left",
             caption="ratio of the RMSE (mm) to uniform's, geometric mean and worst; share of the"
             " way from uniform to the oracle, mean and least; wrong: off by > 20 mm and > 2 %",

@@ -115,9 +115,7 @@ class Case:
 
 
 def _loop(case: Case, rounds: int, selector: Selector | Worth | None = None) -> Pixels:
-    return acquire(
-        case.frame.measure, case.seeds, rounds=rounds, selector=selector, shots=case.shots
-    ).uv
+    return acquire(case.frame.measure, case.seeds, rounds=rounds, selector=selector, shots=case.shots).uv
 
 
 def _gradient(case: Case) -> Pixels:
@@ -216,27 +214,21 @@ STRATEGIES: dict[str, Strategy] = {
     "random": Strategy("anywhere near a sample", _random, chance=True),
     "gap": Strategy("farthest from the samples first", lambda c: c.best(c.samples.gap_px())),
     "variance": Strategy(
-        "largest kriging variance, local fits",
-        lambda c: c.best(np.nan_to_num(c.improvement.variance_mm2)),
+        "largest kriging variance, local fits", lambda c: c.best(np.nan_to_num(c.improvement.variance_mm2))
     ),
     "neural_gas": Strategy(
         "neural gas, published rule, even spread", lambda c: c.spread(c.regions.mask), chance=True
     ),
     "neural_gas_complement": Strategy(
-        "neural gas, long-edge complement, even spread",
-        lambda c: c.spread(c.regions.complement),
-        chance=True,
+        "neural gas, long-edge complement, even spread", lambda c: c.spread(c.regions.complement), chance=True
     ),
-    "improvement": Strategy(
-        "published improvement (eq. 23), one shot", lambda c: c.best(c.improvement.raw)
-    ),
+    "improvement": Strategy("published improvement (eq. 23), one shot", lambda c: c.best(c.improvement.raw)),
     "improvement_loop": Strategy(
         "published improvement, closed loop", lambda c: _selected(c, "improvement", loop=True)
     ),
     "gradient": Strategy("gradient of the interpolated depth, one shot", _gradient),
     "quadtree": Strategy(
-        "quad-tree, largest error split first",
-        lambda c: quadtree(c.frame.measure, c.seeds, c.shots),
+        "quad-tree, largest error split first", lambda c: quadtree(c.frame.measure, c.seeds, c.shots)
     ),
     "step": Strategy("step score, one shot", lambda c: _loop(c, 1)),
     "loop": Strategy("surface score, closed loop: the default", lambda c: _loop(c, c.rounds)),
@@ -247,9 +239,7 @@ STRATEGIES: dict[str, Strategy] = {
         reference=True,
     ),
     "uniform_70": Strategy(
-        "a lattice of 70 % of all pixels",
-        lambda c: c.lattice(0.7 * c.frame.depth_mm.size),
-        reference=True,
+        "a lattice of 70 % of all pixels", lambda c: c.lattice(0.7 * c.frame.depth_mm.size), reference=True
     ),
 }
 for _name, _words in SELECTORS.items():

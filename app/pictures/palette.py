@@ -40,9 +40,7 @@ class Scale:
     def colour(self, values: npt.NDArray[np.generic]) -> Image:
         """Colours of values of any shape, red-green-blue in one axis more; NaN is the dark end."""
         low, high = self.limits
-        level = np.clip(
-            np.rint((np.nan_to_num(values, nan=low) - low) * (255 / (high - low))), 0, 255
-        )
+        level = np.clip(np.rint((np.nan_to_num(values, nan=low) - low) * (255 / (high - low))), 0, 255)
         return np.asarray(channels(palette(self.colormap))[level.astype(np.uint8)])
 
 

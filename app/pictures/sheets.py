@@ -68,9 +68,7 @@ def sheet(rows: Sequence[Row], width_in: float = WIDTH_IN, *, legend: bool = Tru
 
     columns = max(len(shown) for _, shown in rows)
     each = (WIDTH_IN - _GAP * (columns + 1)) / columns
-    heights = [
-        max(each * p.image.shape[0] / p.image.shape[1] for p in shown if p) for _, shown in rows
-    ]
+    heights = [max(each * p.image.shape[0] / p.image.shape[1] for p in shown if p) for _, shown in rows]
     extras = [(_TITLE if title else 0.0) + _CAPTION + _FOOT for title, _ in rows]
     height = sum(heights) + sum(extras) + _GAP + _LEGEND * legend
     zoom = width_in / WIDTH_IN
@@ -161,11 +159,7 @@ def _caption(axes: Axes, panel: Panel, each: float, tall: float, zoom: float) ->
     bar = axes.inset_axes((0, -0.18 / tall, _BAR, 0.1 / tall))
     bar.imshow(palette.channels(colours)[None], aspect="auto")
     bar.set_axis_off()
-    for text, at, side in (
-        (f"{low:g}", 0, "left"),
-        (unit, 0.5, "center"),
-        (f"{high:g}", 1, "right"),
-    ):
+    for text, at, side in ((f"{low:g}", 0, "left"), (unit, 0.5, "center"), (f"{high:g}", 1, "right")):
         axes.text(at * _BAR, -0.34 / tall, text, ha=side, **below)
 
 

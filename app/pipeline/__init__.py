@@ -2,13 +2,7 @@
 
 from selective_depth.app.pipeline.feed import Feed, Read, open_and_tell, state_of
 from selective_depth.app.pipeline.pipeline import Pipeline
-from selective_depth.app.pipeline.report import (
-    RunReport,
-    is_settings,
-    print_report,
-    save_settings,
-    say,
-)
+from selective_depth.app.pipeline.report import RunReport, is_settings, print_report, save_settings, say
 from selective_depth.app.pipeline.result import FrameResult, Model, SensorNote
 from selective_depth.app.pipeline.timing import STAGES, StageSummary, StageTimes
 

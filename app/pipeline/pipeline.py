@@ -74,9 +74,7 @@ class Pipeline:
         self._selector = selector_of(settings, self._threads)
         self._remembers = settings.acquire.memory == "still"
         if self._remembers and not settings.acquire.budget:
-            raise UsageError(
-                "--memory still spends a --budget in every frame; give one, such as 2%."
-            )
+            raise UsageError("--memory still spends a --budget in every frame; give one, such as 2%.")
         self._memory: TemporalAcquisition | None = None
         self._realtime = realtime
         # The stages are compiled and free of the GIL: side by side they take as long as the
@@ -244,10 +242,7 @@ class Pipeline:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._beside.shutdown(cancel_futures=True)
         self._modelling.shutdown(cancel_futures=True)

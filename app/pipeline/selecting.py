@@ -37,10 +37,7 @@ def improvement_of(settings: Settings, threads: int | None) -> ImprovementSelect
     """The improvement map that the options describe."""
     options = settings.improvement
     return ImprovementSelector(
-        share=options.share,
-        exponent=options.exponent,
-        threads=threads,
-        by_sums=options.formula == "eq27",
+        share=options.share, exponent=options.exponent, threads=threads, by_sums=options.formula == "eq27"
     )
 
 
@@ -84,8 +81,7 @@ def _of_ones_own(by: str) -> Selector | Worth:
     path = Path(file)
     if not colon or path.suffix != ".py":
         raise UsageError(
-            f"--by is '{by}'; it must be one of {', '.join(NAMES)}, or FILE.py:NAME, a selector of"
-            " your own."
+            f"--by is '{by}'; it must be one of {', '.join(NAMES)}, or FILE.py:NAME, a selector of your own."
         )
     if not path.is_file():
         raise UsageError(f"--by is '{by}', but there is no file '{file}'; check its name.")
@@ -96,9 +92,7 @@ def _of_ones_own(by: str) -> Selector | Worth:
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise UsageError(
-            f"--by is '{by}', but '{file}' fails: {type(error).__name__}: {error}."
-        ) from error
+        raise UsageError(f"--by is '{by}', but '{file}' fails: {type(error).__name__}: {error}.") from error
     found: Any = getattr(module, name, None)
     if isinstance(found, type):  # a class: its instances are the selectors
         found = found()

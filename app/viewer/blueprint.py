@@ -62,18 +62,12 @@ def blueprint(
     )
     columns.append(
         rrb.Spatial3DView(
-            origin="/",
-            contents=space,
-            name="In space",
-            eye_controls=eye,
-            background=legend.BACKGROUND,
+            origin="/", contents=space, name="In space", eye_controls=eye, background=legend.BACKGROUND
         )
     )
     shares = [1.0] * (len(columns) - 1) + [1.6]
     return rrb.Blueprint(
-        rrb.Vertical(
-            rrb.Horizontal(*columns, column_shares=shares), _figures(memory), row_shares=[2.2, 1]
-        ),
+        rrb.Vertical(rrb.Horizontal(*columns, column_shares=shares), _figures(memory), row_shares=[2.2, 1]),
         rrb.TimePanel(timeline="frame", play_state="following", state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -127,15 +121,12 @@ def _figures(memory: bool) -> rrb.Horizontal:
 def epoch_blueprint(limits_mm: tuple[float, float]) -> rrb.Blueprint:
     """Layout for trainings of several lengths: nodes, kept triangles and long edges, in space."""
     grey = _grey(limits_mm)
-    space = rrb.Spatial3DView(
-        origin="/", contents=["/world/nodes", "/world/regions"], name="In space"
-    )
+    space = rrb.Spatial3DView(origin="/", contents=["/world/nodes", "/world/regions"], name="In space")
     error = rrb.TimeSeriesView(origin="/figures", name="Quantisation error in mm")
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
-                _image("Nodes", "gas/nodes", over=grey),
-                _image("Long edges", "gas/complement", over=grey),
+                _image("Nodes", "gas/nodes", over=grey), _image("Long edges", "gas/complement", over=grey)
             ),
             _image("Kept triangles", "gas/mask", "gas/triangles", over=grey),
             rrb.Vertical(space, error, row_shares=[2, 1]),

@@ -54,13 +54,7 @@ class Handover(Generic[T]):
     """
 
     def __init__(
-        self,
-        name: str,
-        sink: Sink[T],
-        *,
-        lossless: bool,
-        patience_s: float = 0.0,
-        capacity: int = 2,
+        self, name: str, sink: Sink[T], *, lossless: bool, patience_s: float = 0.0, capacity: int = 2
     ) -> None:
         self.name = name
         self.dropped = 0
@@ -86,9 +80,7 @@ class Handover(Generic[T]):
                 while self._full():
                     self._changed.wait(0.2)
             elif self._full() and not self._stalled:
-                self._stalled = not self._changed.wait_for(
-                    lambda: not self._full(), self._patience_s
-                )
+                self._stalled = not self._changed.wait_for(lambda: not self._full(), self._patience_s)
             if self.failure is not None:
                 self.dropped += 1
                 return

@@ -57,9 +57,7 @@ class StepLogger:
             self._log_memory(step.memory)
         self._log_figures(step)
 
-    def log_trainings(
-        self, frame: DepthFrame, trainings: Iterable[tuple[int, RegionSelection]]
-    ) -> None:
+    def log_trainings(self, frame: DepthFrame, trainings: Iterable[tuple[int, RegionSelection]]) -> None:
         """Log the regions of one frame after trainings of several lengths, by epoch."""
         near, far = legend.depth_limits_mm(frame.depth_mm)
         self._limits_mm = (float(near), float(far))
@@ -143,9 +141,7 @@ class StepLogger:
         log("camera/holes", rr.SegmentationImage((depth_mm == 0).view(np.uint8), opacity=1.0))
         near, far = self._limits_mm
         level = np.clip((seeds.depth_mm.ravel() - near) * (255 / (far - near)), 0, 255)
-        colours = np.where(
-            seeds.valid.ravel(), DEPTH_COLOURS[level.astype(np.uint8)], np.uint32(legend.HOLE)
-        )
+        colours = np.where(seeds.valid.ravel(), DEPTH_COLOURS[level.astype(np.uint8)], np.uint32(legend.HOLE))
         log("camera/seeds", rr.Points2D.from_fields(colors=colours))
         self.log_state(step.state)
 
@@ -162,22 +158,16 @@ class StepLogger:
         log("camera/gas/nodes", rr.Points2D(nodes_uv, colors=legend.NODE, radii=1.4))
         nodes_m = regions.nodes_mm * np.float32(0.001)
         log("world/nodes", rr.Points3D(nodes_m, colors=legend.NODE, radii=-1.5))
-        mesh = rr.Mesh3D(
-            vertex_positions=nodes_m, triangle_indices=kept, albedo_factor=legend.REGION
-        )
+        mesh = rr.Mesh3D(vertex_positions=nodes_m, triangle_indices=kept, albedo_factor=legend.REGION)
         log("world/regions", mesh)
 
     def _log_improvement(self, step: FrameResult) -> None:
         log, improvement = self._stream.log, step.improvement
         known = improvement.known
         log("camera/improvement/score", _map_image(improvement.score, legend.IMPROVEMENT, known))
-        log(
-            "camera/improvement/unknown", rr.SegmentationImage((~known).view(np.uint8), opacity=1.0)
-        )
+        log("camera/improvement/unknown", rr.SegmentationImage((~known).view(np.uint8), opacity=1.0))
         if self._options.detail:
-            log(
-                "camera/improvement/estimate", self._depth_image(_as_depth(improvement.estimate_mm))
-            )
+            log("camera/improvement/estimate", self._depth_image(_as_depth(improvement.estimate_mm)))
             deviation_mm = np.sqrt(np.where(known, improvement.variance_mm2, 0))
             image = _map_image(deviation_mm, legend.ERROR, known)
             log("camera/improvement/deviation", image)
@@ -204,9 +194,7 @@ class StepLogger:
     def _log_memory(self, memory: TemporalStep) -> None:
         """Age of what is known, fresh bright, and what was forgotten in this frame."""
         level = np.where(memory.known, 255 - np.minimum(8 * memory.age_frames, 200), 0)
-        image = rr.DepthImage(
-            level.astype(np.uint8), colormap=legend.AGE_COLOURMAP, depth_range=[0.0, 255.0]
-        )
+        image = rr.DepthImage(level.astype(np.uint8), colormap=legend.AGE_COLOURMAP, depth_range=[0.0, 255.0])
         self._stream.log("camera/memory/age", image)
         changed = np.zeros_like(memory.changed) if memory.restarted else memory.changed
         self._stream.log("camera/memory/changed", rr.SegmentationImage(changed.view(np.uint8)))
@@ -220,10 +208,7 @@ class StepLogger:
 
     def _depth_image(self, depth_mm: npt.NDArray[np.uint16]) -> rr.DepthImage:
         return rr.DepthImage(
-            depth_mm,
-            meter=1000.0,
-            colormap=legend.DEPTH_COLOURMAP,
-            depth_range=list(self._limits_mm),
+            depth_mm, meter=1000.0, colormap=legend.DEPTH_COLOURMAP, depth_range=list(self._limits_mm)
         )
 
 

@@ -60,8 +60,7 @@ def screenshot(recording: Path, frame: int | None = None) -> npt.NDArray[np.uint
         raise ViewerError(f"'{recording}' cannot be shown: {error.strerror}.") from None
     if magic != _MAGIC:
         raise ViewerError(
-            f"'{recording}' is no Rerun recording; 'selective-depth replay SOURCE --save"
-            " FILE.rrd' makes one."
+            f"'{recording}' is no Rerun recording; 'selective-depth replay SOURCE --save FILE.rrd' makes one."
         )
     # The viewer complains on the terminal where there is none, as on a server.
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
@@ -71,10 +70,7 @@ def screenshot(recording: Path, frame: int | None = None) -> npt.NDArray[np.uint
         try:
             with interrupt.deferred():
                 client = ViewerClient.spawn(
-                    headless=True,
-                    port=port,
-                    hide_welcome_screen=True,
-                    executable_path=viewer_executable(),
+                    headless=True, port=port, hide_welcome_screen=True, executable_path=viewer_executable()
                 )
                 stack.callback(client.quit)
         except RuntimeError as error:

@@ -250,8 +250,7 @@ class RemotePlace(Place):
         listener = ask(self.url) if listens(self._address) else None
         if listener is None:
             raise ViewerError(
-                f"no viewer listens at {self.url}. Start one there with 'rerun', or leave out"
-                " --connect."
+                f"no viewer listens at {self.url}. Start one there with 'rerun', or leave out --connect."
             )
         if not listener.rerun:
             raise ViewerError(f"what listens at {self.url} is {listener.name}, no Rerun viewer.")
@@ -346,9 +345,7 @@ def _host_and_port(url: str) -> tuple[str, int]:
     except ValueError as error:
         raise ViewerError(f"'{url}' is no viewer's address: {error}.") from None
     if parts.scheme not in ("rerun", "rerun+http", "rerun+https") or not parts.hostname:
-        raise ViewerError(
-            f"'{url}' is no viewer's address; write --connect rerun+http://HOST:PORT/proxy."
-        )
+        raise ViewerError(f"'{url}' is no viewer's address; write --connect rerun+http://HOST:PORT/proxy.")
     return parts.hostname, port or PORTS[0]
 
 

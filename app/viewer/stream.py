@@ -93,9 +93,7 @@ class Recording:
         else:
             self._logger.log(item)
 
-    def log_trainings(
-        self, frame: DepthFrame, trainings: Iterable[tuple[int, RegionSelection]]
-    ) -> None:
+    def log_trainings(self, frame: DepthFrame, trainings: Iterable[tuple[int, RegionSelection]]) -> None:
         """Log one frame's regions after trainings of several lengths."""
         self._logger.log_trainings(frame, trainings)
 
@@ -136,9 +134,7 @@ def never_wait_at_exit() -> None:
     rr.unregister_shutdown()
 
 
-def save_trainings(
-    path: Path, frame: DepthFrame, trainings: Iterable[tuple[int, RegionSelection]]
-) -> None:
+def save_trainings(path: Path, frame: DepthFrame, trainings: Iterable[tuple[int, RegionSelection]]) -> None:
     """Write an .rrd of one frame's regions after trainings of several lengths.
 
     Raises
@@ -152,15 +148,11 @@ def save_trainings(
     except OSError as error:
         raise cannot_write(path, error) from None
     never_wait_at_exit()
-    recording = Recording.to_file(
-        path, f"{APPLICATION} epochs", ViewerOptions(detail=True), index=True
-    )
+    recording = Recording.to_file(path, f"{APPLICATION} epochs", ViewerOptions(detail=True), index=True)
     recording.log_trainings(frame, trainings)
     if not recording.is_written(path):
         recording.abandon()
         if path.is_file():
             path.unlink()
-        raise OutputError(
-            f"writing '{path}' failed. Check the disk and its quota, and run it again."
-        )
+        raise OutputError(f"writing '{path}' failed. Check the disk and its quota, and run it again.")
     recording.finish()

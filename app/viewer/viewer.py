@@ -12,14 +12,7 @@ from selective_depth.app.console.errors import ViewerError
 from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.handover import Handover
-from selective_depth.app.viewer.sinks import (
-    FilePlace,
-    Place,
-    RemotePlace,
-    ServedPlace,
-    Showing,
-    WindowPlace,
-)
+from selective_depth.app.viewer.sinks import FilePlace, Place, RemotePlace, ServedPlace, Showing, WindowPlace
 from selective_depth.app.viewer.stream import APPLICATION, never_wait_at_exit
 from selective_depth.app.viewer.window import BIRTH_S, has_display
 from selective_depth.drivers.errors import OutputError

@@ -58,9 +58,7 @@ class CameraFile:
             return None
         fx, fy, cx, cy = self.intrinsics
         if self.size is None and not (
-            width / 4 < cx < width * 3 / 4
-            and height / 4 < cy < height * 3 / 4
-            and width / 4 < fx < width * 4
+            width / 4 < cx < width * 3 / 4 and height / 4 < cy < height * 3 / 4 and width / 4 < fx < width * 4
         ):
             return None
         try:

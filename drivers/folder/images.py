@@ -167,9 +167,7 @@ def read_png(path: Path) -> DepthArray:
     _check_chunks(path, data)
     raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if raw is None or raw.dtype != np.uint16 or raw.shape != shape:
-        raise DamagedRecordingError(
-            f"'{path}' cannot be decoded although its checksums are right; {_NEXT}."
-        )
+        raise DamagedRecordingError(f"'{path}' cannot be decoded although its checksums are right; {_NEXT}.")
     return np.asarray(raw, dtype=np.uint16)
 
 
@@ -201,8 +199,7 @@ def _read_bytes(path: Path, limit: int) -> bytes:
             return file.read(limit)
     except OSError as error:
         raise DamagedRecordingError(
-            f"'{path}' cannot be read ({error.strerror}); check that it is there and its"
-            " permissions."
+            f"'{path}' cannot be read ({error.strerror}); check that it is there and its permissions."
         ) from error
 
 
@@ -211,9 +208,7 @@ def _size_from_header(path: Path, header: bytes) -> tuple[int, int]:
         what = "empty" if not header else "no PNG file, whatever its name says"
         raise DamagedRecordingError(f"'{path}' is {what}; {_NEXT}.")
     if len(header) < HEADER_BYTES:
-        raise DamagedRecordingError(
-            f"'{path}' is cut off after {len(header)} bytes; copy it again."
-        )
+        raise DamagedRecordingError(f"'{path}' is cut off after {len(header)} bytes; copy it again.")
     width, height = (int.from_bytes(header[at : at + 4], "big") for at in (16, 20))
     bits, colour = header[24], header[25]
     if (bits, colour) != (16, 0):

@@ -254,9 +254,7 @@ def _images(root: Path, pattern: str, below: Path) -> list[Path]:
         and below in path.absolute().parents
     ]
     first = min((path.parent for path in files), default=root)
-    return sorted(
-        (path for path in files if path.parent == first), key=lambda path: _natural_key(path.name)
-    )
+    return sorted((path for path in files if path.parent == first), key=lambda path: _natural_key(path.name))
 
 
 def _natural_key(name: str) -> list[tuple[int, Decimal, str]]:
@@ -264,9 +262,7 @@ def _natural_key(name: str) -> list[tuple[int, Decimal, str]]:
     if re.fullmatch(_DECIMAL, stem):
         return [(0, Decimal(stem), name)]
     parts = re.findall(r"[0-9]+|[^0-9]+", name)
-    return [
-        (0, Decimal(part), part) if part.isdecimal() else (1, Decimal(0), part) for part in parts
-    ]
+    return [(0, Decimal(part), part) if part.isdecimal() else (1, Decimal(0), part) for part in parts]
 
 
 def _stamps(row: Layout, files: list[Path]) -> tuple[int, ...] | None:
@@ -327,9 +323,7 @@ def _read_list(root: Path, index: Path) -> tuple[list[Path], tuple[int, ...]]:
 
 
 def _nothing_found(path: Path) -> str:
-    looked = (
-        f"no depth frames in '{path}': looked for 16-bit PNG files in it and in '{path / 'depth'}'"
-    )
+    looked = f"no depth frames in '{path}': looked for 16-bit PNG files in it and in '{path / 'depth'}'"
     for inner in sorted(path.iterdir()):
         if inner.is_dir() and (count := len(image_names(inner))):
             return f"{looked}. '{inner}' holds PNG files ({count}): give that folder."

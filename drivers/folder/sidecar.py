@@ -129,8 +129,7 @@ def read_text(path: Path) -> str:
             data = file.read(_MAX_TEXT_BYTES + 1)
         if len(data) > _MAX_TEXT_BYTES:
             raise DamagedRecordingError(
-                f"'{path}' is larger than {_MAX_TEXT_BYTES // 2**20} MiB, which no sidecar is;"
-                " remove it."
+                f"'{path}' is larger than {_MAX_TEXT_BYTES // 2**20} MiB, which no sidecar is; remove it."
             )
         return data.decode("utf-8-sig")
     except OSError as error:
@@ -155,16 +154,12 @@ def _camera(path: Path, entries: dict[str, Any]) -> Camera | None:
     for key in _CAMERA_KEYS[2:]:
         _number(path, table, key, -MOST_PX, MOST_PX)
     try:
-        return Camera(
-            table["width"], table["height"], *(float(table[key]) for key in _CAMERA_KEYS[2:])
-        )
+        return Camera(table["width"], table["height"], *(float(table[key]) for key in _CAMERA_KEYS[2:]))
     except ValueError as error:
         raise _wrong(path, "camera", error, "a camera that can be") from error
 
 
-def _number(
-    path: Path, entries: dict[str, Any], name: str, least: float, most: float
-) -> float | None:
+def _number(path: Path, entries: dict[str, Any], name: str, least: float, most: float) -> float | None:
     value = entries.get(name)
     if value is None:
         return None
@@ -195,6 +190,4 @@ def _wrong(path: Path, name: str, got: object, allowed: str) -> DamagedRecording
         shown = f"{got!s:.80}"
     except ValueError:  # Python refuses to print whole numbers of thousands of digits
         shown = "a number too long to print"
-    return DamagedRecordingError(
-        f"'{name:.40}' in '{path}' is wrong: got {shown}; allowed is {allowed}."
-    )
+    return DamagedRecordingError(f"'{name:.40}' in '{path}' is wrong: got {shown}; allowed is {allowed}.")

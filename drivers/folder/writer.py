@@ -41,9 +41,7 @@ class FolderWriter:
         If the folder cannot be made or written, or is in use.
     """
 
-    def __init__(
-        self, path: str | Path, *, fps: float = _DEFAULT_FPS, compression: int = 3
-    ) -> None:
+    def __init__(self, path: str | Path, *, fps: float = _DEFAULT_FPS, compression: int = 3) -> None:
         self.path = Path(path)
         self._compression = compression
         self._sidecar = Sidecar(values_per_metre=_MILLIMETRES, fps=fps)
@@ -52,8 +50,7 @@ class FolderWriter:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             used = any(
-                entry.suffix.lower() == ".png" or entry.name == SIDECAR
-                for entry in self.path.iterdir()
+                entry.suffix.lower() == ".png" or entry.name == SIDECAR for entry in self.path.iterdir()
             )
         except OSError as error:
             raise _output_error(self.path, error) from error
@@ -107,10 +104,7 @@ class FolderWriter:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if isinstance(error, OutputError | ValueError):
             self.discard()  # a source that failed leaves what it gave; a writer, nothing
@@ -127,11 +121,7 @@ class FolderWriter:
 
 
 def write_folder(
-    path: str | Path,
-    frames: Iterable[DepthFrame],
-    *,
-    fps: float | None = None,
-    compression: int = 3,
+    path: str | Path, frames: Iterable[DepthFrame], *, fps: float | None = None, compression: int = 3
 ) -> int:
     """Save frames as a folder of 16-bit PNG files that `RecordedFolder` reads back bit by bit.
 

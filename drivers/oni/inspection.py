@@ -51,12 +51,7 @@ from selective_depth.drivers.oni.records import (
 from selective_depth.drivers.oni.report import STREAMS, OniFrame, OniNode, OniProblem, OniReport
 
 _MAX_NODES: Final = 64
-_SIZES: Final = {
-    "xnMapOutputMode": 12,
-    "xnCropping": 12,
-    "xnFOV": 16,
-    "xnRealWorldTranslationData": 24,
-}
+_SIZES: Final = {"xnMapOutputMode": 12, "xnCropping": 12, "xnFOV": 16, "xnRealWorldTranslationData": 24}
 _SHAPING: Final = ("xnMapOutputMode", "xnCropping", "oniPixelFormat")
 """Properties that tell what a frame's values are; one that changes ends what can be read."""
 _SCAN_BYTES: Final = 1 << 20
@@ -315,8 +310,7 @@ class _Inspection:
         )
         if record.node > self.highest_node:
             raise RecordError(
-                f"node {record.node} is beyond the highest that the header states,"
-                f" {self.highest_node}"
+                f"node {record.node} is beyond the highest that the header states, {self.highest_node}"
             )
         if addition.node_type in STREAMS and addition.codec not in CODECS:
             raise RecordError(f"the compression {addition.codec!r} is not known")
@@ -351,8 +345,7 @@ class _Inspection:
         last = node.frames[-1] if node.frames else None
         if number != (last.number if last else 0) + 1:
             self._problem(
-                record.offset,
-                f"frame {number} follows frame {last.number if last else 0} of {node.name}",
+                record.offset, f"frame {number} follows frame {last.number if last else 0} of {node.name}"
             )
             if last is not None and number <= last.number:
                 return
@@ -367,8 +360,7 @@ class _Inspection:
             raise RecordError(f"node {node.number} expects it at byte {node.seek_table_offset}")
         if record.payload_size != (len(node.frames) + 1) * form.size:
             raise RecordError(
-                f"it has {record.payload_size // form.size - 1} entries for {len(node.frames)}"
-                " frames"
+                f"it has {record.payload_size // form.size - 1} entries for {len(node.frames)} frames"
             )
         node.has_seek_table = True
         self.file.seek(record.payload_offset)
@@ -378,8 +370,7 @@ class _Inspection:
         for frame, entry in zip(node.frames, list(form.iter_unpack(table))[1:], strict=True):
             if (entry[0], entry[2]) != (frame.timestamp_us, frame.record_offset):
                 self._problem(
-                    record.offset,
-                    f"the seek table and frame {frame.number} disagree on its place or time",
+                    record.offset, f"the seek table and frame {frame.number} disagree on its place or time"
                 )
                 return
 
@@ -398,13 +389,11 @@ class _Inspection:
                 )
             elif node.declared_frames != there and not node.changed:
                 self._problem(
-                    self.size,
-                    f"{node.declared_frames} {node.name} frames are announced, {there} are there",
+                    self.size, f"{node.declared_frames} {node.name} frames are announced, {there} are there"
                 )
             if node.seek_table_offset and node.declared_frames and not node.has_seek_table:
                 self._problem(
-                    self.size,
-                    f"there is no sound seek table of {node.name} at byte {node.seek_table_offset}",
+                    self.size, f"there is no sound seek table of {node.name} at byte {node.seek_table_offset}"
                 )
 
     def _decode_frames(self, node: OniNode, form: DepthForm) -> tuple[int, int, list[str]]:

@@ -177,9 +177,7 @@ def parse_addition(record: Record, old: bool) -> NodeAddition:
         }[record.kind]
     )
     if len(rest) != form.size:
-        raise RecordError(
-            f"its fields after the name have {len(rest)} bytes instead of {form.size}"
-        )
+        raise RecordError(f"its fields after the name have {len(rest)} bytes instead of {form.size}")
     values = form.unpack(rest)
     frames = values[2] if len(values) > 2 else UNKNOWN_COUNT
     return NodeAddition(
@@ -191,9 +189,7 @@ def parse_addition(record: Record, old: bool) -> NodeAddition:
     )
 
 
-def pack_addition(
-    addition: NodeAddition, latest_us: int = LATEST_TIME, seek_table_offset: int = 0
-) -> bytes:
+def pack_addition(addition: NodeAddition, latest_us: int = LATEST_TIME, seek_table_offset: int = 0) -> bytes:
     """Fields of a NODE_ADDED record."""
     frames = UNKNOWN_COUNT if addition.frames is None else addition.frames
     return _text(addition.name) + struct.pack(

@@ -110,9 +110,7 @@ def mend_oni(path: str | Path) -> int:
                     file.write(payload[-2:])
                     mended += 1
     except OSError as error:
-        raise OutputError(
-            f"'{path}' cannot be written ({error.strerror}); check its permissions."
-        ) from error
+        raise OutputError(f"'{path}' cannot be written ({error.strerror}); check its permissions.") from error
     return mended
 
 

@@ -74,9 +74,7 @@ class RecordWriter:
         try:
             self._file: BinaryIO = path.open("xb")
         except FileExistsError:
-            raise OutputError(
-                f"'{path}' exists already; give another name, or remove it."
-            ) from None
+            raise OutputError(f"'{path}' exists already; give another name, or remove it.") from None
         except OSError as error:
             raise self._failed(error) from error
         self._offset = 0
@@ -86,9 +84,7 @@ class RecordWriter:
         self._latest_us = 0
         self._append(self._header(LATEST_TIME))
 
-    def add_node(
-        self, number: int, addition: NodeAddition, properties: dict[str, Property]
-    ) -> None:
+    def add_node(self, number: int, addition: NodeAddition, properties: dict[str, Property]) -> None:
         """Add a stream and what is known of it."""
         self._nodes[number] = addition
         self._entries[number] = []
@@ -143,9 +139,7 @@ class RecordWriter:
             table_offset = 0
             if entries and len(table) <= MAX_PAYLOAD:  # longer, OpenNI2 refuses; it may be missing
                 table_offset = self._append(pack_record(Kind.SEEK_TABLE, number, payload=table))
-            counted = NodeAddition(
-                node.name, node.node_type, node.codec, len(entries), table_offset
-            )
+            counted = NodeAddition(node.name, node.node_type, node.codec, len(entries), table_offset)
             latest_us = entries[-1][0] if entries else 0
             additions.append((start, number, pack_addition(counted, latest_us, table_offset)))
         self._append(pack_record(Kind.END, 0))
@@ -246,10 +240,7 @@ class OniWriter:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if isinstance(error, OutputError | ValueError):
             self._writer.discard()  # a source that failed leaves what it gave; a writer, nothing

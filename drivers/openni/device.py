@@ -160,9 +160,7 @@ class OpenNIDevice(DepthSource):
             camera = replace(camera, cx=camera.width - 1 - camera.cx)
         self.camera = camera
         self.fps = float(about["fps"])
-        self._supervisor = threading.Thread(
-            target=self._supervise, name="openni-supervisor", daemon=True
-        )
+        self._supervisor = threading.Thread(target=self._supervise, name="openni-supervisor", daemon=True)
         self._supervisor.start()
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
@@ -184,9 +182,7 @@ class OpenNIDevice(DepthSource):
         """
         self.check_process()
         with self._changed:
-            self._changed.wait_for(
-                lambda: self._newest or self._failure or self._closing.is_set(), timeout_s
-            )
+            self._changed.wait_for(lambda: self._newest or self._failure or self._closing.is_set(), timeout_s)
             if self._closing.is_set():
                 raise SourceEndedError(f"{self.uri} has been closed.")
             if self._failure is not None:
@@ -221,9 +217,7 @@ class OpenNIDevice(DepthSource):
                 " as soon as it is there."
             )
         advice = " Check its cable and its power supply." if self.state == "stalled" else ""
-        return SourceTimeoutError(
-            f"The sensor {self.uri} gave no frame within {timeout_s:g} s.{advice}"
-        )
+        return SourceTimeoutError(f"The sensor {self.uri} gave no frame within {timeout_s:g} s.{advice}")
 
     def _become(self, state: str, why: str = "") -> None:
         with self._changed:
@@ -259,9 +253,7 @@ class OpenNIDevice(DepthSource):
                 elif message["kind"] == "error":
                     raise error_of(message)
                 elif message["kind"] == "died":
-                    raise DeviceRefusedError(
-                        f"The sensor {self.uri} does not open: {message['reason']}."
-                    )
+                    raise DeviceRefusedError(f"The sensor {self.uri} does not open: {message['reason']}.")
             raise SourceEndedError(f"{self.uri} has been closed.")
         except BaseException:
             worker.close()

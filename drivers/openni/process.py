@@ -117,9 +117,7 @@ class Worker:
 
     def take(self, frame: Message, width: int, height: int) -> DepthArray:
         """Copy a ``frame`` message's image out of the shared memory and free its slot."""
-        pixels = np.frombuffer(
-            self._memory, np.uint16, width * height, offset=frame["slot"] * _SLOT_BYTES
-        )
+        pixels = np.frombuffer(self._memory, np.uint16, width * height, offset=frame["slot"] * _SLOT_BYTES)
         image = pixels.reshape(height, width).copy()
         self._tell(f"free {frame['slot']}")
         return image

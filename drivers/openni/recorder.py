@@ -138,9 +138,7 @@ def _create(path: Path, unborn: Path, overwrite: bool) -> int:
             )
         return os.open(unborn, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
     except OSError as error:
-        raise OutputError(
-            f"'{path}' cannot be written: {error.strerror}. Give a place that can."
-        ) from error
+        raise OutputError(f"'{path}' cannot be written: {error.strerror}. Give a place that can.") from error
 
 
 def _wait_for_stream(worker: Worker) -> None:

@@ -65,8 +65,7 @@ def find_runtime() -> Runtime:
                 return Runtime((folder / name).absolute())
     where = f"{variable} names {chosen}" if chosen else f"looked in {', '.join(map(str, folders))}"
     raise RuntimeMissingError(
-        f"The OpenNI2 runtime ({_LIBRARY_NAMES[system][-1]}) was not found: {where}."
-        f" {_INSTALL[system]}"
+        f"The OpenNI2 runtime ({_LIBRARY_NAMES[system][-1]}) was not found: {where}. {_INSTALL[system]}"
     )
 
 
@@ -75,14 +74,8 @@ def _usual_folders(system: str) -> list[Path]:
         roots = [os.environ.get(name) for name in ("ProgramFiles", "ProgramFiles(x86)")]
         return [Path(root) / "OpenNI2" / "Redist" for root in roots if root]
     if system == "darwin":
-        return [
-            Path(root, "lib", sub)
-            for root in ("/opt/homebrew", "/usr/local")
-            for sub in ("ni2", "")
-        ]
+        return [Path(root, "lib", sub) for root in ("/opt/homebrew", "/usr/local") for sub in ("ni2", "")]
     multiarch = f"{platform.machine()}-linux-gnu"
     return [
-        Path(root, sub)
-        for root in ("/usr/local", "/usr")
-        for sub in (f"lib/{multiarch}", "lib", "lib64")
+        Path(root, sub) for root in ("/usr/local", "/usr") for sub in (f"lib/{multiarch}", "lib", "lib64")
     ]

@@ -26,9 +26,7 @@ _DRIVERS = {  # OpenNI2's driver for it, and where it comes from
 
 
 def usb_advice(
-    drivers: Collection[str],
-    bus: Path = Path("/sys/bus/usb/devices"),
-    nodes: Path = Path("/dev/bus/usb"),
+    drivers: Collection[str], bus: Path = Path("/sys/bus/usb/devices"), nodes: Path = Path("/dev/bus/usb")
 ) -> str:
     """What to do about a sensor that is plugged in but not found, or not opened.
 
@@ -52,8 +50,7 @@ def usb_advice(
         if not any(driver.lower() in one.lower() for one in drivers):
             having = ", ".join(sorted(drivers)) or "none"
             return (
-                f"A {name} is on the USB bus, but OpenNI2 has no driver for it (it has: {having}):"
-                f" {remedy}."
+                f"A {name} is on the USB bus, but OpenNI2 has no driver for it (it has: {having}): {remedy}."
             )
         if not os.access(found[number], os.R_OK | os.W_OK):
             return (
@@ -71,9 +68,7 @@ def _devices(bus: Path, nodes: Path) -> dict[tuple[int, int], Path]:
     found = {}
     for device in bus.glob("*"):
         try:
-            vendor, product = (
-                int((device / name).read_text(), 16) for name in ("idVendor", "idProduct")
-            )
+            vendor, product = (int((device / name).read_text(), 16) for name in ("idVendor", "idProduct"))
             place = [int((device / name).read_text()) for name in ("busnum", "devnum")]
         except (OSError, ValueError):
             continue  # an interface, or it was pulled out just now

@@ -205,9 +205,7 @@ class LiveStream:
 
     def _register(self, wanted: bool) -> None:
         device = self.device
-        mode = (
-            openni2.IMAGE_REGISTRATION_DEPTH_TO_COLOR if wanted else openni2.IMAGE_REGISTRATION_OFF
-        )
+        mode = openni2.IMAGE_REGISTRATION_DEPTH_TO_COLOR if wanted else openni2.IMAGE_REGISTRATION_OFF
         known = device.is_property_supported(c_api.ONI_DEVICE_PROPERTY_IMAGE_REGISTRATION)
         if known and device.is_image_registration_mode_supported(mode):
             if device.get_image_registration_mode() != mode:

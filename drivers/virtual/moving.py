@@ -43,9 +43,7 @@ def stopping_ball(b: Builder, time_s: float) -> None:
 
 def person(b: Builder, time_s: float) -> None:
     """A box of a person's size walks from the right at 1 m/s, 1.9 m away."""
-    b.box(
-        Material.CLOTH, (1.2 * OUTSIDE_MM - PERSON_MM_S * time_s, 250.0, 1900.0), (450, 1700, 300)
-    )
+    b.box(Material.CLOTH, (1.2 * OUTSIDE_MM - PERSON_MM_S * time_s, 250.0, 1900.0), (450, 1700, 300))
 
 
 def chair(b: Builder, time_s: float) -> None:

@@ -161,9 +161,7 @@ def _normal(x):  # type: ignore[no-untyped-def]
     """A nearly normal number: the sum of the four 16-bit parts of a state of xorshift64*."""
     x *= np.uint64(0x2545F4914F6CDD1D)
     # Two by two, side by side in one word: 17 bits hold a sum of two.
-    pairs = (x & np.uint64(0x0000FFFF0000FFFF)) + (
-        (x >> np.uint64(16)) & np.uint64(0x0000FFFF0000FFFF)
-    )
+    pairs = (x & np.uint64(0x0000FFFF0000FFFF)) + ((x >> np.uint64(16)) & np.uint64(0x0000FFFF0000FFFF))
     total = np.int32((pairs & np.uint64(0xFFFFFFFF)) + (pairs >> np.uint64(32)))
     return np.float32(total) * np.float32(_FROM_SUM / 65536.0) - np.float32(2.0 * _FROM_SUM)
 

@@ -83,9 +83,7 @@ class MeshSource(DepthSource):
         points_mm, triangles = place(read_ply(Path(name)), side, camera)
         depth_mm = render(points_mm, triangles, camera, splat)
         if not depth_mm.any():
-            raise SourceNotFoundError(
-                f"nothing of '{name}' is seen from its {side} side; try another side"
-            )
+            raise SourceNotFoundError(f"nothing of '{name}' is seen from its {side} side; try another side")
         if fit == "object":
             depth_mm, camera = cut_to_object(depth_mm, camera)
         self.camera = camera
@@ -106,9 +104,7 @@ class MeshSource(DepthSource):
         self._next = self.frame_count
 
 
-def place(
-    mesh: Mesh, side: str, camera: Camera
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
+def place(mesh: Mesh, side: str, camera: Camera) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
     """Put an object before the camera, as near as the frame allows.
 
     Parameters
@@ -140,10 +136,7 @@ def place(
 
 
 def render(
-    points_mm: npt.NDArray[np.float64],
-    triangles: npt.NDArray[np.int32],
-    camera: Camera,
-    splat: int = 0,
+    points_mm: npt.NDArray[np.float64], triangles: npt.NDArray[np.int32], camera: Camera, splat: int = 0
 ) -> DepthArray:
     """Depth image of triangles, or of bare points where there are none.
 
@@ -181,9 +174,7 @@ def cut_to_object(depth_mm: DepthArray, camera: Camera) -> tuple[DepthArray, Cam
     top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
     part = np.ascontiguousarray(depth_mm[top:bottom, left:right])
     height, width = part.shape
-    return part, Camera(
-        width, height, camera.fx, camera.fy, camera.cx - int(left), camera.cy - int(top)
-    )
+    return part, Camera(width, height, camera.fx, camera.fy, camera.cx - int(left), camera.cy - int(top))
 
 
 def _splat_for(u: npt.NDArray[np.float64], v: npt.NDArray[np.float64]) -> int:
@@ -212,9 +203,7 @@ def _fill_triangles(u, v, inverse, triangles, nearness):  # type: ignore[no-unty
                 wb = ((column - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (row - v[a])) / area
                 wc = ((u[b] - u[a]) * (row - v[a]) - (column - u[a]) * (v[b] - v[a])) / area
                 if wb >= 0.0 and wc >= 0.0 and wb + wc <= 1.0:
-                    near = (
-                        inverse[a] + wb * (inverse[b] - inverse[a]) + wc * (inverse[c] - inverse[a])
-                    )
+                    near = inverse[a] + wb * (inverse[b] - inverse[a]) + wc * (inverse[c] - inverse[a])
                     if near > nearness[row, column]:
                         nearness[row, column] = near
 
@@ -226,7 +215,5 @@ def _fill_points(u, v, inverse, splat, nearness):  # type: ignore[no-untyped-def
     for i in range(len(u)):
         middle_row, middle_column = round(v[i]), round(u[i])
         for row in range(max(middle_row - splat, 0), min(middle_row + splat + 1, height)):
-            for column in range(
-                max(middle_column - splat, 0), min(middle_column + splat + 1, width)
-            ):
+            for column in range(max(middle_column - splat, 0), min(middle_column + splat + 1, width)):
                 nearness[row, column] = max(nearness[row, column], inverse[i])

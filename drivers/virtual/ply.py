@@ -96,9 +96,7 @@ def read_ply(path: Path) -> Mesh:
             start = _read_element(data, start, order, element, columns)
         return _mesh(columns)
     except _NoPlyError:
-        raise SourceNotFoundError(
-            f"'{path}' is no PLY file: it does not begin with the line 'ply'"
-        ) from None
+        raise SourceNotFoundError(f"'{path}' is no PLY file: it does not begin with the line 'ply'") from None
     except _BadPlyError as error:
         raise DamagedRecordingError(
             f"'{path}' cannot be read: {error}. Export the object again as PLY."
@@ -175,9 +173,7 @@ def _binary(text: bytes, elements: list[_Element]) -> bytes:
     try:
         numbers = np.fromiter(map(float, words), "<f8", len(words))
     except ValueError as error:
-        raise _BadPlyError(
-            f"its text holds something else than numbers ({error!s:.100})"
-        ) from error
+        raise _BadPlyError(f"its text holds something else than numbers ({error!s:.100})") from error
     for element in elements:
         for each in element.properties:
             each.scalar, each.count = "d", each.count and "d"
@@ -232,9 +228,7 @@ def _walk(data: bytes, at: int, order: str, element: _Element, rows: int) -> tup
             begins.append(at)
             lengths.append(length)
             at += length * size
-    return [
-        (np.array(begins, np.int64), np.array(lengths, np.int64)) for begins, lengths in found
-    ], at
+    return [(np.array(begins, np.int64), np.array(lengths, np.int64)) for begins, lengths in found], at
 
 
 def _gather(
@@ -285,6 +279,6 @@ def _fans(lengths: npt.NDArray[np.int64], corners: npt.NDArray[np.int32]) -> npt
     counts = np.maximum(lengths - 2, 0)
     first = np.repeat(np.cumsum(lengths) - lengths, counts)
     step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    return np.stack(
-        (corners[first], corners[first + step + 1], corners[first + step + 2]), axis=1
-    ).astype(np.int32)
+    return np.stack((corners[first], corners[first + step + 1], corners[first + step + 2]), axis=1).astype(
+        np.int32
+    )

@@ -66,9 +66,7 @@ class Shapes:
         names = ("kind", "material", "centre", "first", "second", "size")
         return Shapes(*(np.concatenate((getattr(self, n), getattr(others, n))) for n in names))
 
-    def seen_from(
-        self, rotation: npt.NDArray[np.float64], position_mm: npt.NDArray[np.float64]
-    ) -> Shapes:
+    def seen_from(self, rotation: npt.NDArray[np.float64], position_mm: npt.NDArray[np.float64]) -> Shapes:
         """The same shapes in a camera's axes (x right, y down, z forward).
 
         Parameters

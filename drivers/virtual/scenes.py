@@ -93,9 +93,7 @@ class Builder:
         """A rectangle `w` by `h` along `first` and `second`, seen from their cross product."""
         self._add(QUAD, material, centre, first, second, (w / 2, h / 2))
 
-    def box(
-        self, material: Material, centre: Vector, size: Vector, yaw: float = 0, pitch: float = 0
-    ) -> None:
+    def box(self, material: Material, centre: Vector, size: Vector, yaw: float = 0, pitch: float = 0) -> None:
         """Six quads, each facing outwards."""
         turn = turn_of(yaw, pitch)
         for k in range(3):
@@ -104,21 +102,14 @@ class Builder:
                 middle = np.array(centre) + sign * size[k] / 2 * turn[:, k]
                 first, second = turn[:, one], sign * turn[:, two]
                 self.quad(
-                    material,
-                    vector_of(middle),
-                    vector_of(first),
-                    vector_of(second),
-                    size[one],
-                    size[two],
+                    material, vector_of(middle), vector_of(first), vector_of(second), size[one], size[two]
                 )
 
     def sphere(self, material: Material, centre: Vector, radius: float) -> None:
         """A ball."""
         self._add(SPHERE, material, centre, size=(radius, 0))
 
-    def rod(
-        self, material: Material, start: Vector, end: Vector, radius: float, ends: str = "flat"
-    ) -> None:
+    def rod(self, material: Material, start: Vector, end: Vector, radius: float, ends: str = "flat") -> None:
         """A cylinder with flat, round or open ends."""
         a, b = np.array(start), np.array(end)
         length = float(np.linalg.norm(b - a))
@@ -130,9 +121,7 @@ class Builder:
             elif ends == "round":
                 self.sphere(material, point, radius)
 
-    def ring(
-        self, material: Material, centre: Vector, axis: Vector, middle: float, tube: float
-    ) -> None:
+    def ring(self, material: Material, centre: Vector, axis: Vector, middle: float, tube: float) -> None:
         """A torus."""
         length = math.hypot(*axis)
         unit = (axis[0] / length, axis[1] / length, axis[2] / length)
@@ -194,12 +183,7 @@ def workstation() -> Scene:
     b.box(Material.WOOD, (0, desk + 230, 2480), (1630, 400, 20))
     for k in range(3):
         b.box(Material.WOOD, (-560, desk + 150 + 215 * k, 2120), (400, 205, 640))
-        b.rod(
-            Material.METAL,
-            (-630, desk + 150 + 215 * k, 1785),
-            (-490, desk + 150 + 215 * k, 1785),
-            8,
-        )
+        b.rod(Material.METAL, (-630, desk + 150 + 215 * k, 1785), (-490, desk + 150 + 215 * k, 1785), 8)
     b.box(Material.BLACK, (520, floor - 220, 2200), (190, 440, 460))
     # Two monitors, turned towards the user, screens set back in their frames.
     for x, yaw in ((-330, 14), (300, -16)):
@@ -210,14 +194,7 @@ def workstation() -> Scene:
         middle = foot + turn @ (0, -290, 0)
         b.box(Material.PLASTIC, vector_of(middle), (540, 345, 40), yaw)
         screen = middle + turn @ (0, 0, -20.5)
-        b.quad(
-            Material.SCREEN,
-            vector_of(screen),
-            vector_of(turn[:, 1]),
-            vector_of(turn[:, 0]),
-            300,
-            500,
-        )
+        b.quad(Material.SCREEN, vector_of(screen), vector_of(turn[:, 1]), vector_of(turn[:, 0]), 300, 500)
     # On the desk.
     b.box(Material.BLACK, (-60, desk - 12, 1900), (450, 24, 150), 4, 4)
     b.rod(Material.PLASTIC, (290, desk - 18, 1900), (300, desk - 18, 1945), 19, "round")
@@ -271,9 +248,7 @@ def exercise_ball() -> Scene:
     for x, z, yaw in ((-560, 1500, 35), (520, 1420, -60)):
         turn = turn_of(yaw, 0)
         grip = np.array((x, floor - 62, float(z)))
-        b.rod(
-            Material.METAL, vector_of(grip - turn[:, 0] * 75), vector_of(grip + turn[:, 0] * 75), 15
-        )
+        b.rod(Material.METAL, vector_of(grip - turn[:, 0] * 75), vector_of(grip + turn[:, 0] * 75), 15)
         for sign in (-1, 1):
             inner, outer = grip + sign * turn[:, 0] * 70, grip + sign * turn[:, 0] * 135
             b.rod(Material.RUBBER, vector_of(inner), vector_of(outer), 52)
@@ -355,9 +330,7 @@ def fire_hose() -> Scene:
     b.rod(Material.PAINT, (700, floor - 90, 1800), (700, floor - 480, 1800), 82, "round")
     b.rod(Material.BLACK, (700, floor - 560, 1800), (700, floor - 640, 1800), 26)
     b.chain(
-        Material.BLACK,
-        [(720, floor - 610, 1790), (800, floor - 560, 1770), (815, floor - 380, 1770)],
-        13,
+        Material.BLACK, [(720, floor - 610, 1790), (800, floor - 560, 1770), (815, floor - 380, 1770)], 13
     )
     b.rod(Material.METAL, (-900, 560, 1320), (-420, 585, 1290), 24, "round")
     for x, z in ((-840.0, 1316.0), (-470.0, 1293.0)):

@@ -101,9 +101,7 @@ def shots_of(budget: float, shape: tuple[int, int]) -> int:
     pixels = shape[0] * shape[1]
     whole = isinstance(budget, int | np.integer)
     if whole and budget == 1:
-        raise ValueError(
-            "a budget of 1 may be one measurement or every pixel; give shots=1 or budget=1.0"
-        )
+        raise ValueError("a budget of 1 may be one measurement or every pixel; give shots=1 or budget=1.0")
     shots = budget if whole else budget * pixels
     if not 0 <= shots <= pixels:  # NaN is not either
         raise ValueError(

@@ -49,9 +49,7 @@ def _note_misses(
         for v in range(top, bottom + 1):
             for u in range(left, right + 1):
                 miss_sq[v, u] = min(miss_sq[v, u], (u - u0) ** 2 + (v - v0) ** 2)
-        touched[top // TILE_PX : bottom // TILE_PX + 1, left // TILE_PX : right // TILE_PX + 1] = (
-            True
-        )
+        touched[top // TILE_PX : bottom // TILE_PX + 1, left // TILE_PX : right // TILE_PX + 1] = True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -73,11 +73,7 @@ def krige_row(  # type: ignore[no-untyped-def]
     for j in range(len(columns)):
         count = 0
         for k in range(3):
-            over, beside, under = (
-                padded[i, j + k] > 0,
-                padded[i + 1, j + k] > 0,
-                padded[i + 2, j + k] > 0,
-            )
+            over, beside, under = (padded[i, j + k] > 0, padded[i + 1, j + k] > 0, padded[i + 2, j + k] > 0)
             count += over + beside + under
         # One sample alone says nothing of how depth varies around it.
         held[place[j]] = count if count > 1 else 0

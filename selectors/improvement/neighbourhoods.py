@@ -220,9 +220,7 @@ def _windows(frame_shape: tuple[int, int], rows: bytes, columns: bytes, exponent
     row_axis = Axis.of(height, at_rows, reach_px)
     column_axis = Axis.of(width, at_columns, reach_px)
     widest = max(row_axis.longest, column_axis.longest)
-    windows = Windows(
-        row_axis, column_axis, reach_px, power_table(exponent, 2 * widest + 2), exponent
-    )
+    windows = Windows(row_axis, column_axis, reach_px, power_table(exponent, 2 * widest + 2), exponent)
     if windows.most_pixels > MAX_PIXELS:
         raise ValueError(
             f"a lattice of {len(at_rows)}x{len(at_columns)} seeds on {height}x{width} pixels leaves"
@@ -239,9 +237,7 @@ def windows_of(seeds: SeedGrid, exponent: float) -> Windows:
     return _windows(seeds.frame_shape, rows, columns, exponent)
 
 
-def windows_over(
-    frame_shape: tuple[int, int], lattice: tuple[int, int], exponent: float
-) -> Windows:
+def windows_over(frame_shape: tuple[int, int], lattice: tuple[int, int], exponent: float) -> Windows:
     """The windows about the cell centres of a lattice of so many rows and columns."""
     rows = cell_centres(frame_shape[0], lattice[0]).tobytes()
     columns = cell_centres(frame_shape[1], lattice[1]).tobytes()

@@ -264,9 +264,7 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
             x0, x1 = max(start, 0), min(end, frame_width)
             if not asked[y0:y1, x0:x1].any():
                 continue
-            count = _gather(
-                measured, spiral, rows[i], columns[j], up[i], down[i], left[j], right[j], samples
-            )
+            count = _gather(measured, spiral, rows[i], columns[j], up[i], down[i], left[j], right[j], samples)
             # One sample alone says nothing of how depth varies around it.
             if count < 2:
                 continue
@@ -283,9 +281,7 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
                         distances[n, p] = line[reach + x - u[n]]
                         p += 1
             box = Box(start, top, width, height)
-            krige_window(
-                samples, count, a, b, between, distances, 0, box, measured.shape, scratch, by_sums
-            )
+            krige_window(samples, count, a, b, between, distances, 0, box, measured.shape, scratch, by_sums)
             for y in range(y0, y1):
                 gap = up[i] if y < rows[i] else down[i]
                 share_y = count * (1.0 - abs(y - rows[i]) / gap)

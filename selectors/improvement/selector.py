@@ -17,12 +17,7 @@ from scipy.ndimage import maximum_filter
 
 from selective_depth.selectors.choice import choose
 from selective_depth.selectors.improvement.lattice import lattice_scratch
-from selective_depth.selectors.improvement.map import (
-    LEVEL_SHIFT,
-    LEVELS,
-    best_threshold,
-    improvement_rows,
-)
+from selective_depth.selectors.improvement.map import LEVEL_SHIFT, LEVELS, best_threshold, improvement_rows
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_of
 from selective_depth.selectors.improvement.scattered import (
     EXPONENT,
@@ -30,11 +25,7 @@ from selective_depth.selectors.improvement.scattered import (
     ImprovementMap,
     map_scattered,
 )
-from selective_depth.selectors.improvement.systems import (
-    aligned_zeros,
-    sample_buffers,
-    window_scratch,
-)
+from selective_depth.selectors.improvement.systems import aligned_zeros, sample_buffers, window_scratch
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid

@@ -83,8 +83,7 @@ def local_systems(seeds: SeedGrid, u: int, v: int, exponent: float = EXPONENT) -
             found.append((share_down * share_across * count, a, b, uv, depth))
     total = sum(weight for weight, *_ in found)
     return [
-        LocalSystem(weight / total, a, b, uv, depth, neighbours[inside])
-        for weight, a, b, uv, depth in found
+        LocalSystem(weight / total, a, b, uv, depth, neighbours[inside]) for weight, a, b, uv, depth in found
     ]
 
 

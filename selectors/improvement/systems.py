@@ -250,14 +250,8 @@ def krige_window(  # type: ignore[no-untyped-def]
         n0, n1 = row_of[k + 1], row_of[k + 2] if k + 1 < m else row_of[0]
         n2 = row_of[k + 3] if k + 2 < m else row_of[0]
         n3 = row_of[k + 4] if k + 3 < m else row_of[0]
-        c0, c1 = (
-            np.float32(a * between[row_of[0], n0] + b),
-            np.float32(a * between[row_of[0], n1] + b),
-        )
-        c2, c3 = (
-            np.float32(a * between[row_of[0], n2] + b),
-            np.float32(a * between[row_of[0], n3] + b),
-        )
+        c0, c1 = (np.float32(a * between[row_of[0], n0] + b), np.float32(a * between[row_of[0], n1] + b))
+        c2, c3 = (np.float32(a * between[row_of[0], n2] + b), np.float32(a * between[row_of[0], n3] + b))
         h0, h1 = distances[n0, first : first + pixels], distances[n1, first : first + pixels]
         h2, h3 = distances[n2, first : first + pixels], distances[n3, first : first + pixels]
         for p in range(pixels):
@@ -269,12 +263,7 @@ def krige_window(  # type: ignore[no-untyped-def]
             earlier = U[e * _STRIDE : (e + BLOCK) * _STRIDE]
             _subtract_block(block, earlier, L[k : k + BLOCK], e, pixels)
         _solve_block(block, L[k : k + BLOCK, k : k + BLOCK], pixels)
-        f0, f1, f2, f3 = (
-            np.float32(y[k]),
-            np.float32(y[k + 1]),
-            np.float32(y[k + 2]),
-            np.float32(y[k + 3]),
-        )
+        f0, f1, f2, f3 = (np.float32(y[k]), np.float32(y[k + 1]), np.float32(y[k + 2]), np.float32(y[k + 3]))
         for p in range(pixels):
             r0, r1 = block[p], block[_STRIDE + p]
             r2, r3 = block[2 * _STRIDE + p], block[3 * _STRIDE + p]

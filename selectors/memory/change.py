@@ -35,9 +35,7 @@ Float32Array = npt.NDArray[np.float32]
 BoolArray = npt.NDArray[np.bool_]
 
 
-def contradicts(
-    uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Float32Array
-) -> BoolArray:
+def contradicts(uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Float32Array) -> BoolArray:
     """Which measurements lie outside the range of the model about them, shape (n,).
 
     A miss contradicts nothing: much of what does not return does so now and then.
@@ -66,10 +64,7 @@ def _contradict(
 
 
 def drift(
-    uv: npt.NDArray[np.int32],
-    depth_mm: Float32Array,
-    model_mm: Float32Array,
-    noise_mm: Float32Array,
+    uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Float32Array, noise_mm: Float32Array
 ) -> float:
     """How many standard errors the mean of a block's look-outs is off, median over the blocks.
 

@@ -255,8 +255,7 @@ class TemporalAcquisition:
             uv=np.concatenate(sensor.uv),
             depth_mm=np.concatenate(sensor.depth_mm),
             batch=np.repeat(
-                np.minimum(np.arange(len(sensor.uv)), 255).astype(np.uint8),
-                [len(uv) for uv in sensor.uv],
+                np.minimum(np.arange(len(sensor.uv)), 255).astype(np.uint8), [len(uv) for uv in sensor.uv]
             ),
             model_mm=model_mm,
             known_mm=self._memory.fused_mm.copy(),
@@ -365,9 +364,7 @@ class TemporalAcquisition:
         self._book(sensor, first)
 
 
-def _votes_about(
-    uv: npt.NDArray[np.int32], votes: npt.NDArray[np.uint8]
-) -> npt.NDArray[np.integer]:
+def _votes_about(uv: npt.NDArray[np.int32], votes: npt.NDArray[np.uint8]) -> npt.NDArray[np.integer]:
     """How many of the pixels measured beside each contradicted, shape (n,)."""
     padded = np.pad(votes, NEAR_PX)
     u, v = uv[:, 0] + NEAR_PX, uv[:, 1] + NEAR_PX

@@ -2,16 +2,8 @@
 
 from selective_depth.selectors.neural_gas.batch import BatchNeuralGas
 from selective_depth.selectors.neural_gas.exact import train_exact
-from selective_depth.selectors.neural_gas.regions import (
-    EdgeMetric,
-    RegionSelection,
-    delaunay_regions,
-)
-from selective_depth.selectors.neural_gas.selector import (
-    LongEdgeSelector,
-    NeuralGasSelector,
-    node_pixels,
-)
+from selective_depth.selectors.neural_gas.regions import EdgeMetric, RegionSelection, delaunay_regions
+from selective_depth.selectors.neural_gas.selector import LongEdgeSelector, NeuralGasSelector, node_pixels
 
 __all__ = [
     "BatchNeuralGas",

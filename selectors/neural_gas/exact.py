@@ -72,9 +72,7 @@ def train_exact(
 
 
 def anneal(
-    points_mm: npt.NDArray[np.float32],
-    nodes_mm: npt.NDArray[np.float32],
-    draws: npt.NDArray[np.int32],
+    points_mm: npt.NDArray[np.float32], nodes_mm: npt.NDArray[np.float32], draws: npt.NDArray[np.int32]
 ) -> npt.NDArray[np.float32]:
     """Take the published steps from given nodes, over given draws.
 

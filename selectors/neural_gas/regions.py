@@ -186,9 +186,7 @@ def delaunay_regions(
     )
 
 
-def triangulate(
-    uv: npt.NDArray[np.float32],
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+def triangulate(uv: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """Delaunay triangulation of points of the image plane.
 
     The points are first rounded to a fraction of a pixel: in whole numbers the triangulation is

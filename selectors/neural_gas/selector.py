@@ -12,11 +12,7 @@ from scipy.spatial import cKDTree
 
 from selective_depth.selectors.neural_gas.batch import BatchNeuralGas
 from selective_depth.selectors.neural_gas.exact import train_exact
-from selective_depth.selectors.neural_gas.regions import (
-    EdgeMetric,
-    RegionSelection,
-    delaunay_regions,
-)
+from selective_depth.selectors.neural_gas.regions import EdgeMetric, RegionSelection, delaunay_regions
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.selection import Selection
@@ -192,9 +188,7 @@ class LongEdgeSelector:
         return self.gas.select(samples).long_edges()
 
 
-def node_pixels(
-    nodes_mm: npt.NDArray[np.float32], samples: SeedGrid | Samples
-) -> npt.NDArray[np.float32]:
+def node_pixels(nodes_mm: npt.NDArray[np.float32], samples: SeedGrid | Samples) -> npt.NDArray[np.float32]:
     """Pixels (column, row) on which nodes fall.
 
     Parameters
@@ -218,9 +212,7 @@ def node_pixels(
     weight = 1 / (distance + 1e-3)
     # Neighbours in space may lie at both ends of a panorama's rows: no mean over the seam.
     weight[np.abs(uv[..., 0] - uv[:, :1, 0]) > samples.frame_shape[1] / 4] = 0
-    mean: npt.NDArray[np.float64] = (uv * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[
-        :, None
-    ]
+    mean: npt.NDArray[np.float64] = (uv * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[:, None]
     return mean.astype(np.float32)
 
 

@@ -243,10 +243,7 @@ class Mesh:
 
     @classmethod
     def of(
-        cls,
-        uv: npt.NDArray[np.integer],
-        capacity: int = 0,
-        extent_px: tuple[int, int] | None = None,
+        cls, uv: npt.NDArray[np.integer], capacity: int = 0, extent_px: tuple[int, int] | None = None
     ) -> Mesh | None:
         """Triangulate points, all different and not negative; None if they lie on one line.
 

@@ -69,9 +69,7 @@ class Layers(NamedTuple):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _touch(
-    touched: npt.NDArray[np.bool_], top: Whole, left: Whole, bottom: Whole, right: Whole
-) -> None:
+def _touch(touched: npt.NDArray[np.bool_], top: Whole, left: Whole, bottom: Whole, right: Whole) -> None:
     """Book a change of pixels in these rows and columns, which their neighbours may heed."""
     rows, columns = touched.shape
     first_column, last_column = max(left - 1, 0) // TILE_PX, (right + 1) // TILE_PX
@@ -109,9 +107,7 @@ def _claim(layers: Layers, uv: Int32Array) -> None:
                     break
                 while first > 0 and (first - 1 - u0) ** 2 + dv_sq < layers.gap_sq[v, first - 1]:
                     first -= 1
-                while (
-                    last < width - 1 and (last + 1 - u0) ** 2 + dv_sq < layers.gap_sq[v, last + 1]
-                ):
+                while last < width - 1 and (last + 1 - u0) ** 2 + dv_sq < layers.gap_sq[v, last + 1]:
                     last += 1
                 for u in range(first, last + 1):
                     gap_sq[v, u] = (u - u0) * (u - u0) + dv_sq
@@ -189,12 +185,7 @@ def _draw(
             owned[k] = hull or dv > 0 or (dv == 0 and du > 0)
         area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)  # positive: they run anticlockwise
         inverse = 1 / area
-        left, right, top, bottom = (
-            min(u0, u1, u2),
-            max(u0, u1, u2),
-            min(v0, v1, v2),
-            max(v0, v1, v2),
-        )
+        left, right, top, bottom = (min(u0, u1, u2), max(u0, u1, u2), min(v0, v1, v2), max(v0, v1, v2))
         _touch(layers.touched, top, left, bottom, right)
         for v in range(top, bottom + 1):
             # The three weights are linear along a row: one more pixel is one addition each.
@@ -311,9 +302,7 @@ class Surface:
                 other = np.zeros(len(self._uv), np.bool_)
                 other[point[again][differ]] = True
                 end = self._mesh.triangles
-                _mark_stars(
-                    self._mesh.tri[:end], self._mesh.adj[:end], other, self._mesh.changed[:end]
-                )
+                _mark_stars(self._mesh.tri[:end], self._mesh.adj[:end], other, self._mesh.changed[:end])
         self._insert(uv[point < 0], depth_mm[point < 0])
         self._draw_changed()
         if differ.any():
@@ -332,9 +321,7 @@ class Surface:
         self._depth_mm = np.concatenate((self._depth_mm, mm))
         layers.samples_mm[uv[:, 1], uv[:, 0]] = mm
         if first:  # one by one, the first of many samples would claim whole images
-            layers.nearest[:], layers.gap_sq[:] = nearest_sample(
-                layers.samples_mm > 0, self._threads
-            )
+            layers.nearest[:], layers.gap_sq[:] = nearest_sample(layers.samples_mm > 0, self._threads)
             layers.depth_mm[:] = layers.samples_mm.ravel()[layers.nearest]
             layers.touched[:] = True
         else:

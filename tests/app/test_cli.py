@@ -27,13 +27,7 @@ from selective_depth.app.console import dispatch
 from selective_depth.app.console.command import COMMANDS, SHELLS, parse
 from selective_depth.app.console.settings_file import to_toml
 from selective_depth.app.pipeline import save_settings
-from selective_depth.app.settings import (
-    MOST_ROUNDS,
-    GasOptions,
-    RunOptions,
-    Settings,
-    ViewerOptions,
-)
+from selective_depth.app.settings import MOST_ROUNDS, GasOptions, RunOptions, Settings, ViewerOptions
 from selective_depth.app.viewer import sinks as places
 from selective_depth.drivers.errors import OutputError
 
@@ -72,9 +66,7 @@ def start(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
 
 def depth_rows(path: Path) -> int:
     return sum(
-        chunk.num_rows
-        for chunk in RrdReader(str(path)).stream()
-        if chunk.entity_path == "/camera/depth"
+        chunk.num_rows for chunk in RrdReader(str(path)).stream() if chunk.entity_path == "/camera/depth"
     )
 
 
@@ -207,12 +199,7 @@ def test_wrong_usage_is_one_line(
     ],
 )
 def test_what_is_wrong_in_a_settings_file_is_said_to_stand_there(
-    text: str,
-    typed: list[str],
-    words: str,
-    named: bool,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    text: str, typed: list[str], words: str, named: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "s.toml"
     file.write_text(text)
@@ -283,18 +270,14 @@ def test_settings_of_an_earlier_run_never_replace_its_recording(tmp_path: Path) 
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes with names and devices are POSIX's")
-def test_settings_that_never_end_are_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_settings_that_never_end_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for file in (tmp_path / "pipe", Path("/dev/zero"), tmp_path):
         code, line = refuse(capsys, "replay", "x", "--settings", str(file))
         assert code == 2
         assert "not a regular file" in line
     (tmp_path / "large").write_bytes(bytes(1 << 20))
-    assert (
-        "1 MiB or more" in refuse(capsys, "replay", "x", "--settings", str(tmp_path / "large"))[1]
-    )
+    assert "1 MiB or more" in refuse(capsys, "replay", "x", "--settings", str(tmp_path / "large"))[1]
 
 
 # Bad input: what people really have
@@ -308,9 +291,7 @@ def test_cut_recording(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> No
 
 
 @pytest.mark.openni
-def test_no_sensor(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, virtual_sensor: VirtualSensor
-) -> None:
+def test_no_sensor(capsys: pytest.CaptureFixture[str], tmp_path: Path, virtual_sensor: VirtualSensor) -> None:
     virtual_sensor.set(connected=0)
     for command in (["live"], ["record", str(tmp_path / "x.oni")]):
         _, line = refuse(capsys, *command)
@@ -404,9 +385,7 @@ def test_a_save_that_fails_at_its_end_is_a_failed_run(
     assert "1  frames" in next(line for line in shown.splitlines() if "not shown in" in line)
 
 
-def test_a_picture_of_nothing_is_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_picture_of_nothing_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     picture = str(tmp_path / "a.png")
     assert "No such file" in refuse(capsys, "screenshot", str(tmp_path / "no.rrd"), picture)[1]
     (tmp_path / "a.rrd").write_text("no recording")
@@ -499,9 +478,7 @@ def test_output_that_cannot_be_written_is_said(tmp_path: Path) -> None:
 
 
 def test_nobody_at_the_viewers_address(capsys: pytest.CaptureFixture[str]) -> None:
-    _, line = refuse(
-        capsys, "replay", ENDLESS, *QUICK, "--connect", "rerun+http://127.0.0.1:9/proxy"
-    )
+    _, line = refuse(capsys, "replay", ENDLESS, *QUICK, "--connect", "rerun+http://127.0.0.1:9/proxy")
     assert "no viewer listens" in line
 
 
@@ -635,9 +612,7 @@ def test_live_sensor_from_the_command_line(
 @pytest.mark.slow
 @pytest.mark.openni
 @pytest.mark.parametrize("seed", range(50))
-def test_interrupted_at_any_moment(
-    tmp_path: Path, seed: int, virtual_sensor: VirtualSensor
-) -> None:
+def test_interrupted_at_any_moment(tmp_path: Path, seed: int, virtual_sensor: VirtualSensor) -> None:
     out = tmp_path / ("out.oni" if seed % 3 == 2 else "out.rrd")
     arguments = (
         ["replay", ENDLESS, *QUICK, "--save", str(out)],
@@ -713,10 +688,7 @@ def test_defaults_on_the_command_line_are_the_selectors_own() -> None:
     from selective_depth.selectors.improvement import ImprovementSelector
     from selective_depth.selectors.neural_gas import NeuralGasSelector
 
-    for options, selector in (
-        (GasOptions(), NeuralGasSelector),
-        (ImprovementOptions(), ImprovementSelector),
-    ):
+    for options, selector in ((GasOptions(), NeuralGasSelector), (ImprovementOptions(), ImprovementSelector)):
         for name, parameter in inspect.signature(selector).parameters.items():
             if name != "threads":
                 assert getattr(options, name) == parameter.default, name

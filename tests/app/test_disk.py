@@ -25,9 +25,7 @@ ALONE = ("unshare", "--user", "--map-root-user", "--mount")
 def can_mount() -> bool:
     """Whether this user may mount for itself alone, as Linux lets most."""
     trial = [*ALONE, "mount", "-t", "tmpfs", "tmpfs", "/mnt"]
-    return (
-        bool(shutil.which("unshare")) and not subprocess.run(trial, capture_output=True).returncode
-    )
+    return bool(shutil.which("unshare")) and not subprocess.run(trial, capture_output=True).returncode
 
 
 pytestmark = pytest.mark.skipif(

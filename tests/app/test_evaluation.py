@@ -113,9 +113,7 @@ def test_the_gradient_shoots_at_steps_either_way(upright: bool) -> None:
     assert np.abs(shots[:, 0 if upright else 1] - step).max() <= 5  # one step of the seeds
 
 
-@pytest.mark.parametrize(
-    ("name", "inside"), [("neural_gas", True), ("neural_gas_complement", False)]
-)
+@pytest.mark.parametrize(("name", "inside"), [("neural_gas", True), ("neural_gas_complement", False)])
 def test_the_gas_shoots_in_its_regions_and_its_complement_outside(name: str, inside: bool) -> None:
     case = Case(frame(), SHAPE, 400, 1, 0)
     u, v = STRATEGIES[name].pixels(case)[len(case.seed_uv) :].T

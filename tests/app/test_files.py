@@ -99,9 +99,7 @@ def test_check_of_what_is_no_recording(
     assert "it is not an .oni recording" in capsys.readouterr().out
 
 
-def test_check_of_a_missing_file_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_of_a_missing_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["check", str(tmp_path / "none.oni")]) == 1
     printed = capsys.readouterr()
     assert printed.out == ""
@@ -178,9 +176,7 @@ def test_a_file_that_export_does_not_write_is_refused(tmp_path: Path, name: str)
     assert not (tmp_path / name).exists()
 
 
-def test_a_principal_point_that_is_lost_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_principal_point_that_is_lost_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     camera = Camera(64, 48, 60.0, 60.0, 30.0, 24.0)
     write_folder(tmp_path / "in", [DepthFrame(np.ones((48, 64), np.uint16), 0, 0, camera)])
     assert export(str(tmp_path / "in"), tmp_path / "out.oni", None) == 0

@@ -84,9 +84,7 @@ hashlib.pbkdf2_hmac("sha256", b"", b"", 100_000_000)  # takes a minute and looks
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals between processes are POSIX's")
-@pytest.mark.parametrize(
-    ("program", "number"), [(STUBBORN, signal.SIGINT), (NOT_PYTHON, signal.SIGTERM)]
-)
+@pytest.mark.parametrize(("program", "number"), [(STUBBORN, signal.SIGINT), (NOT_PYTHON, signal.SIGTERM)])
 def test_what_ignores_ctrl_c_is_ended_by_the_watchdog(program: str, number: signal.Signals) -> None:
     def interrupt_it(process: subprocess.Popen[str]) -> None:
         time.sleep(0.5)  # it has said that it is ready, and goes on to its call

@@ -119,9 +119,7 @@ def test_no_text_leaves_the_page_or_runs_into_another(columns: int, row: StillRo
             assert not box.overlaps(boxes[other]), (texts[at], texts[other])
 
 
-def test_the_ending_is_the_format_and_size_and_resolution_are_as_asked(
-    row: StillRow, tmp_path: Path
-) -> None:
+def test_the_ending_is_the_format_and_size_and_resolution_are_as_asked(row: StillRow, tmp_path: Path) -> None:
     begins = {"pdf": b"%PDF", "svg": b"<?xml", "webp": b"RIFF", "png": b"\x89PNG"}
     for ending, begin in begins.items():
         path = tmp_path / f"a.{ending}"
@@ -143,11 +141,7 @@ def test_snapshots_of_one_name_and_of_strange_names_are_all_written(tmp_path: Pa
 def test_snapshot_writes_the_sheet_and_every_panel(tmp_path: Path) -> None:
     sources = ["virtual:ball?size=320x240&frames=2", "virtual:workstation?size=320x240&frames=2"]
     written = snapshot(sources, 1, tmp_path / "new" / "pictures", SMALL, PAGE)
-    assert [path.name for path in written[:3]] == [
-        "sheet.png",
-        "ball-depth.png",
-        "ball-neural-gas.png",
-    ]
+    assert [path.name for path in written[:3]] == ["sheet.png", "ball-depth.png", "ball-neural-gas.png"]
     assert len(written) == 11
     sheet = cv2.imread(str(written[0]))
     assert sheet is not None and sheet.shape[1] == 1600

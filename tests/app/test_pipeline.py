@@ -42,9 +42,7 @@ from selective_depth.drivers.source import DepthSource
 from selective_depth.selectors.acquire import Acquisition
 
 HEIGHT, WIDTH = 48, 64
-SMALL = Settings(
-    seeds=SeedOptions(24, 32), gas=GasOptions(nodes=60), viewer=ViewerOptions(headless=True)
-)
+SMALL = Settings(seeds=SeedOptions(24, 32), gas=GasOptions(nodes=60), viewer=ViewerOptions(headless=True))
 
 
 def make_frame(index: int) -> DepthFrame:
@@ -166,9 +164,7 @@ def test_live_goes_on_through_stall_and_loss(monkeypatch: pytest.MonkeyPatch) ->
 def test_the_report_tells_the_sensors_last_state(monkeypatch: pytest.MonkeyPatch) -> None:
     source = Script([0, 1, DeviceLostError("unplugged")], live=True)
 
-    def read(
-        timeout_s: float = 5.0, plain: Callable[[float], DepthFrame] = source.read
-    ) -> DepthFrame:
+    def read(timeout_s: float = 5.0, plain: Callable[[float], DepthFrame] = source.read) -> DepthFrame:
         if source.state == "lost":
             raise KeyboardInterrupt
         return plain(timeout_s)
@@ -181,9 +177,7 @@ def test_the_report_tells_the_sensors_last_state(monkeypatch: pytest.MonkeyPatch
 def test_what_is_lost_while_starting_is_counted_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     source = Script([0, 8, 9, 12], live=True)
 
-    def read(
-        timeout_s: float = 5.0, plain: Callable[[float], DepthFrame] = source.read
-    ) -> DepthFrame:
+    def read(timeout_s: float = 5.0, plain: Callable[[float], DepthFrame] = source.read) -> DepthFrame:
         frame = plain(timeout_s)
         source.dropped = {0: 0, 8: 7, 9: 7, 12: 9}[frame.index]
         return frame
@@ -225,9 +219,7 @@ def test_stage_loop_holds_what_the_loop_itself_did(monkeypatch: pytest.MonkeyPat
         pipeline.warm_up(make_frame(0))
         train = pipeline._gas.update if pipeline._live_gas else pipeline._gas.select
         # As slow as to outlast all that is done beside it.
-        monkeypatch.setattr(
-            pipeline._gas, train.__name__, lambda seeds: (time.sleep(0.1), train(seeds))[1]
-        )
+        monkeypatch.setattr(pipeline._gas, train.__name__, lambda seeds: (time.sleep(0.1), train(seeds))[1])
         pipeline.make(make_frame(1))
     stages = pipeline.times.summary()
     assert stages["neural_gas"].max_ms >= 100
@@ -277,9 +269,7 @@ def test_a_closed_loop_leaves_no_thread() -> None:
 
 
 @pytest.mark.parametrize(("budget", "realtime"), [(0.05, False), (0.05, True), (0.0, True)])
-def test_results_come_in_order_and_none_is_held_back_from_silence(
-    budget: float, realtime: bool
-) -> None:
+def test_results_come_in_order_and_none_is_held_back_from_silence(budget: float, realtime: bool) -> None:
     """Frames overlap; the results are those of one frame at a time."""
     settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=budget, rounds=2))
     done: list[FrameResult] = []
@@ -436,9 +426,5 @@ def test_without_a_display_the_run_is_saved(
     settings = dataclasses.replace(SMALL, viewer=ViewerOptions())
     code, _ = run(monkeypatch, Script([0, 1]), settings)
     assert code == 0
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "replay.rrd",
-        "replay.toml",
-        "replay.png",
-    }
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"replay.rrd", "replay.toml", "replay.png"}
     assert "No display here" in capsys.readouterr().out

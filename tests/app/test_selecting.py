@@ -61,9 +61,7 @@ def test_every_name_drives_the_shots_its_own_way() -> None:
     assert len({frozenset(each) for each in sets.values()}) == len(sets)
 
 
-@pytest.mark.parametrize(
-    ("name", "by"), [("leftmost", "leftmost"), ("Rightmost", "the right side")]
-)
+@pytest.mark.parametrize(("name", "by"), [("leftmost", "leftmost"), ("Rightmost", "the right side")])
 def test_a_selector_of_one_s_own_comes_from_a_file(tmp_path: Path, name: str, by: str) -> None:
     file = tmp_path / "own.py"
     file.write_text(OWN)
@@ -93,9 +91,7 @@ def test_what_is_no_selector_is_a_sentence(
         selector_of(with_by(by), None)
 
 
-def test_the_report_and_the_settings_name_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_report_and_the_settings_name_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved = tmp_path / "run.rrd"
     words = ["replay", "virtual:ball?size=128x96&frames=2", "--seeds.rows", "24", "--seeds.columns"]
     words += ["32", "--gas.nodes", "60", "--budget", "0.02", "--by", "even", "--headless", "--save"]

@@ -131,8 +131,7 @@ def test_a_long_recording_can_be_replayed(
 ) -> None:
     camera = Camera.kinect()
     frames = (
-        DepthFrame(desk_mm[index % len(desk_mm)], index, index * 33_333, camera)
-        for index in range(count)
+        DepthFrame(desk_mm[index % len(desk_mm)], index, index * 33_333, camera) for index in range(count)
     )
     write_oni(tmp_path / "long.oni", frames)
     check(count, (str(tmp_path / "long.oni"),) * 2, tmp_path)
@@ -222,9 +221,7 @@ def test_a_viewer_stopped_for_half_a_minute_slows_nothing(
     settings = Settings(
         run=RunOptions(frames=30 * int(20 + STOPPED_S)),
         viewer=ViewerOptions(
-            headless=True,
-            save=tmp_path / "soak.rrd",
-            connect=f"rerun+http://127.0.0.1:{listener.port}/proxy",
+            headless=True, save=tmp_path / "soak.rrd", connect=f"rerun+http://127.0.0.1:{listener.port}/proxy"
         ),
     )
     try:

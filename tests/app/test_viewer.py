@@ -113,9 +113,7 @@ def images_of(path: Path, entity: str, dtype: type[np.generic]) -> list[np.ndarr
             continue
         batch = chunk.to_record_batch()
         buffer = next(n for n in batch.schema.names if n.endswith(":buffer"))
-        for frame, data in zip(
-            batch.column("frame").to_pylist(), batch.column(buffer), strict=True
-        ):
+        for frame, data in zip(batch.column("frame").to_pylist(), batch.column(buffer), strict=True):
             pixels = np.asarray(data.values.flatten())
             found[frame] = pixels.view(dtype).reshape(HEIGHT, WIDTH)
     return [found[frame] for frame in sorted(found)]
@@ -149,9 +147,7 @@ def test_file_holds_every_step_bit_for_bit(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("detail", [False, True])
 @pytest.mark.parametrize("acquiring", [False, True])
-def test_every_view_shows_something_that_was_logged(
-    tmp_path: Path, acquiring: bool, detail: bool
-) -> None:
+def test_every_view_shows_something_that_was_logged(tmp_path: Path, acquiring: bool, detail: bool) -> None:
     save(tmp_path / "out.rrd", [make_step(0, acquiring=acquiring)], detail=detail)
     logged = rows_of(tmp_path / "out.rrd")
     views = views_of(blueprint(by="step score" if acquiring else None, detail=detail))
@@ -209,9 +205,7 @@ def test_a_refused_run_leaves_an_older_file_as_it_is(tmp_path: Path) -> None:
         Viewer(chosen, live=False, times=StageTimes())
     assert (tmp_path / "old.rrd").read_bytes() == b"precious"
     with pytest.raises(ViewerError, match="no viewer listens"):
-        Viewer(
-            dataclasses.replace(chosen, save=tmp_path / "new.rrd"), live=False, times=StageTimes()
-        )
+        Viewer(dataclasses.replace(chosen, save=tmp_path / "new.rrd"), live=False, times=StageTimes())
     assert not (tmp_path / "new.rrd").exists()
 
 
@@ -296,9 +290,7 @@ def test_a_write_that_fails_costs_no_more_than_itself(
     assert len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)) == 3
 
 
-@pytest.mark.parametrize(
-    "url", ["http://127.0.0.1:9876", "127.0.0.1:9876", "rerun+http:///proxy", "rubbish"]
-)
+@pytest.mark.parametrize("url", ["http://127.0.0.1:9876", "127.0.0.1:9876", "rerun+http:///proxy", "rubbish"])
 def test_address_that_is_none_is_refused(url: str) -> None:
     with pytest.raises(ViewerError, match="no viewer's address"):
         Viewer(dataclasses.replace(HEADLESS, connect=url), live=True, times=StageTimes())
@@ -380,9 +372,7 @@ def show_for(shown: Viewer, seconds: float, step: FrameResult) -> tuple[int, flo
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no SIGSTOP on this system")
-def test_stalled_viewer_holds_up_nobody_and_spares_the_file(
-    listener: Listener, tmp_path: Path
-) -> None:
+def test_stalled_viewer_holds_up_nobody_and_spares_the_file(listener: Listener, tmp_path: Path) -> None:
     options = dataclasses.replace(listener.options, save=tmp_path / "out.rrd")
     shown = Viewer(options, live=True, times=StageTimes(), frames=100)
     step = make_step(0)
@@ -452,9 +442,7 @@ def test_two_that_have_stalled_are_left_behind_in_the_time_of_one(listener: List
 def test_two_places_see_the_same(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    options = dataclasses.replace(
-        HEADLESS, save=tmp_path / "out.rrd", serve=True, serve_address=address
-    )
+    options = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd", serve=True, serve_address=address)
     shown = Viewer(options, live=False, times=StageTimes(), frames=100)
     for index in range(5):
         shown.show(make_step(index))

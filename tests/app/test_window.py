@@ -31,9 +31,7 @@ from selective_depth.app.viewer import Viewer, window
 from selective_depth.app.viewer.owner import owner_of
 
 pytestmark = pytest.mark.skipif(
-    not sys.platform.startswith("linux")
-    or not shutil.which("Xvfb")
-    or not shutil.which("xwininfo"),
+    not sys.platform.startswith("linux") or not shutil.which("Xvfb") or not shutil.which("xwininfo"),
     reason="no Xvfb and xwininfo here (make system-packages)",
 )
 QUICK = ("--seeds.rows", "24", "--seeds.columns", "32", "--gas.nodes", "60")
@@ -54,9 +52,7 @@ class Screen:
         # Without Composite a window is opaque, so that a picture of the screen shows it.
         options = ["-screen", "0", "640x480x24", "-nolisten", "tcp", "-extension", "Composite"]
         self._server = subprocess.Popen(
-            ["Xvfb", "-displayfd", str(tells), *options],
-            pass_fds=[tells],
-            stderr=subprocess.DEVNULL,
+            ["Xvfb", "-displayfd", str(tells), *options], pass_fds=[tells], stderr=subprocess.DEVNULL
         )
         os.close(tells)
         with os.fdopen(told) as lines:
@@ -81,10 +77,7 @@ class Screen:
     def windows(self) -> int:
         """How many viewer windows the X server has."""
         tree = subprocess.run(
-            ["xwininfo", "-root", "-tree", "-display", self.name],
-            capture_output=True,
-            text=True,
-            check=True,
+            ["xwininfo", "-root", "-tree", "-display", self.name], capture_output=True, text=True, check=True
         )
         return tree.stdout.count('"Rerun')
 
@@ -193,9 +186,7 @@ def quit_viewer(port: int) -> None:
     ViewerClient.connect(window.local_url(port)).run_command("ui.quit")
 
 
-def test_a_run_opens_a_window_that_shows_every_frame_and_stays(
-    screen: Screen, tmp_path: Path
-) -> None:
+def test_a_run_opens_a_window_that_shows_every_frame_and_stays(screen: Screen, tmp_path: Path) -> None:
     scene, saved = SCENE.format(13), tmp_path / "run.rrd"
     # The output is a pipe, which would not end before the window if that had inherited it.
     output = run("replay", scene, "--save", str(saved), cwd=tmp_path, RERUN="off")
@@ -260,9 +251,7 @@ def test_without_a_window_the_run_goes_on_to_a_file(
     assert not screen.viewers
 
 
-def test_a_viewer_killed_at_its_birth_is_named(
-    screen: Screen, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_viewer_killed_at_its_birth_is_named(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
     def kill() -> None:
         until(lambda: screen.viewers)
         screen.clear()
@@ -299,9 +288,7 @@ def test_a_viewer_that_is_slow_to_open_does_not_hold_up_the_run(
     assert bool(screen.viewers) == ("has not opened" in output)
 
 
-def test_others_on_the_ports_are_left_alone(
-    screen: Screen, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_others_on_the_ports_are_left_alone(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
     # Ports of its own: on the usual ones others may come and go on this machine meanwhile.
     first = random.randrange(20_000, 30_000)
     second, third = first + 1, first + 2
@@ -401,9 +388,7 @@ def test_connecting_opens_no_window(screen: Screen, tmp_path: Path) -> None:
 
 
 @pytest.mark.openni
-def test_a_sensor_is_seen_in_the_window(
-    screen: Screen, virtual_sensor: object, tmp_path: Path
-) -> None:
+def test_a_sensor_is_seen_in_the_window(screen: Screen, virtual_sensor: object, tmp_path: Path) -> None:
     output = run("live", "--frames", "15", cwd=tmp_path)
     (port,) = screen.viewers
     missed = int(re.search(r"not shown in viewer window +(\d+) ", output)[1])  # type: ignore[index]

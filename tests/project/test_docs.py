@@ -24,9 +24,7 @@ PAGES = [
 def blocks(language: str) -> list[object]:
     pattern = re.compile(rf"^```{language}\n(.*?)^```", re.DOTALL | re.MULTILINE)
     return [
-        pytest.param(
-            found.group(1), id=f"{page.name}:{page.read_text()[: found.start()].count(chr(10)) + 1}"
-        )
+        pytest.param(found.group(1), id=f"{page.name}:{page.read_text()[: found.start()].count(chr(10)) + 1}")
         for page in PAGES
         for found in pattern.finditer(page.read_text())
     ]

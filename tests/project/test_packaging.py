@@ -16,9 +16,7 @@ def test_selectors_has_no_init_file() -> None:
 
 def test_standard_library_module_wins_at_the_root() -> None:
     code = "import selectors, asyncio; print(selectors.DefaultSelector.__name__)"
-    out = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert out.stdout.strip().endswith("Selector")
 
 

@@ -88,15 +88,11 @@ def test_only_the_chosen_pixels_are_measured_once_and_within_the_budget(
     assert not set(sensor.asked) & {tuple(p) for p in seeds.lattice_uv.reshape(-1, 2).tolist()}
     taken = acquisition.round > 0
     assert [tuple(p) for p in acquisition.uv[taken].tolist()] == sensor.asked
-    np.testing.assert_array_equal(
-        acquisition.depth_mm, depth[acquisition.uv[:, 1], acquisition.uv[:, 0]]
-    )
+    np.testing.assert_array_equal(acquisition.depth_mm, depth[acquisition.uv[:, 1], acquisition.uv[:, 0]])
     assert [r.shots for r in acquisition.rounds] == [
         np.count_nonzero(acquisition.round == n + 1) for n in range(rounds)
     ]
-    assert sum(r.returned for r in acquisition.rounds) == np.count_nonzero(
-        acquisition.depth_mm[taken]
-    )
+    assert sum(r.returned for r in acquisition.rounds) == np.count_nonzero(acquisition.depth_mm[taken])
 
 
 @every_selector
@@ -115,9 +111,7 @@ def test_what_is_not_measured_has_no_say(rounds: int, selector: Selector | Worth
 
 
 @every_selector
-def test_a_later_round_may_only_use_what_earlier_rounds_returned(
-    selector: Selector | Worth,
-) -> None:
+def test_a_later_round_may_only_use_what_earlier_rounds_returned(selector: Selector | Worth) -> None:
     """Replace the returns of the last round: all rounds up to it choose the same."""
     depth = scene(3)
     seeds = SeedGrid.from_array(depth, (24, 26))
@@ -159,9 +153,7 @@ def score_reference(samples: Samples, rule: StepSelector) -> npt.NDArray[np.floa
         chance = weight.sum() / (weight.sum() + (1 / (missed ** (rule.falloff / 2) + 1)).sum())
         gaps = np.sqrt([voters[0][0], voters[min(1, len(voters) - 1)][0]])
         score[v, u] = (
-            (spread + rule.noise_mm**2)
-            * chance**0.5
-            * min(gaps.mean(), rule.gap * samples.pitch_px)
+            (spread + rule.noise_mm**2) * chance**0.5 * min(gaps.mean(), rule.gap * samples.pitch_px)
         )
     return score
 
@@ -229,9 +221,7 @@ def test_the_score_heeds_its_parameters(rule: StepSelector, seed: int) -> None:
     clear = ~last_vote_is_tied(samples, rule.voters)
     assert clear.any()
     expected = score_reference(samples, rule)
-    np.testing.assert_allclose(
-        rule.select(samples).score[clear], expected[clear], rtol=1e-3, atol=1e-3
-    )
+    np.testing.assert_allclose(rule.select(samples).score[clear], expected[clear], rtol=1e-3, atol=1e-3)
 
 
 def test_the_score_is_its_formula_where_no_two_samples_are_equally_near() -> None:
@@ -308,9 +298,7 @@ def choose_reference(score: npt.NDArray[np.float32], shots: int) -> list[float]:
     """Worths of the pixels to choose, best first."""
     padded = np.pad(score, 1)
     height, width = score.shape
-    around = np.max(
-        [padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], axis=0
-    )
+    around = np.max([padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], axis=0)
     worth = np.where(around > score, score * np.float32(CROWDED), score)
     return sorted(worth[worth > 0].tolist(), reverse=True)[:shots]
 
@@ -323,9 +311,7 @@ def choose_reference(score: npt.NDArray[np.float32], shots: int) -> list[float]:
     st.integers(0, 2**32 - 1),
     st.sampled_from([1, 5, 10**6]),
 )
-def test_the_best_pixels_are_chosen(
-    height: int, width: int, shots: int, seed: int, levels: int
-) -> None:
+def test_the_best_pixels_are_chosen(height: int, width: int, shots: int, seed: int, levels: int) -> None:
     score = np.random.default_rng(seed).integers(0, levels + 1, (height, width)).astype(np.float32)
     uv = choose(score, shots)
     expected = choose_reference(score, shots)
@@ -450,9 +436,7 @@ def test_what_is_no_selector_is_refused(wrong: object) -> None:
 def test_a_function_must_answer_for_every_pixel(wrong: object) -> None:
     depth = scene(0)
     with pytest.raises(ValueError, match="must be a number for every pixel, of shape"):
-        acquire(
-            Sensor(depth), SeedGrid.from_array(depth, (8, 8)), shots=9, selector=lambda _: wrong
-        )
+        acquire(Sensor(depth), SeedGrid.from_array(depth, (8, 8)), shots=9, selector=lambda _: wrong)
 
 
 def test_two_plans_on_the_same_samples_know_of_each_other() -> None:
@@ -495,9 +479,7 @@ def test_a_plan_may_not_ask_twice_nor_for_too_much() -> None:
 @pytest.mark.parametrize(("folder", "index"), [("livingroom", 0), ("tabletop", 3)])
 def test_it_is_worth_it_on_real_frames(shared_data: Path, folder: str, index: int) -> None:
     """Figures of `evaluate` on these frames: .205 and .195 in one shot, .147 and .17 in eight."""
-    depth = np.asarray(
-        cv2.imread(str(shared_data / folder / f"{index:06d}.png"), cv2.IMREAD_UNCHANGED)
-    )
+    depth = np.asarray(cv2.imread(str(shared_data / folder / f"{index:06d}.png"), cv2.IMREAD_UNCHANGED))
     seeds = SeedGrid.from_array(depth)
     valid = depth > 0
 
@@ -542,9 +524,7 @@ def test_whole_numbers_beyond_16_bits_keep_their_value() -> None:
     seeds = SeedGrid.from_array(depth, (12, 16))
     acquisition = acquire(lambda uv: depth[uv[:, 1], uv[:, 0]], seeds, 100, 2)
     assert acquisition.depth_mm.dtype == np.float32
-    np.testing.assert_array_equal(
-        acquisition.depth_mm, depth[acquisition.uv[:, 1], acquisition.uv[:, 0]]
-    )
+    np.testing.assert_array_equal(acquisition.depth_mm, depth[acquisition.uv[:, 1], acquisition.uv[:, 0]])
 
 
 @pytest.mark.parametrize("depth_mm", [70_000, 2000.5])

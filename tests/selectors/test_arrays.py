@@ -71,12 +71,8 @@ FUNCTIONS: dict[str, Callable[[npt.NDArray[Any]], npt.NDArray[Any]]] = {
     "SeedGrid.from_array": lambda d: SeedGrid.from_array(d, (12, 16)).depth_mm,
     "Samples.add": added,
     "reconstruct": lambda d: reconstruct(UV, d[UV[:, 1], UV[:, 0]], PLAIN.shape),
-    "improvement_scattered": lambda d: (
-        improvement_scattered(UV, d[UV[:, 1], UV[:, 0]], PLAIN.shape).raw
-    ),
-    "ImprovementSelector": lambda d: (
-        ImprovementSelector().select(SeedGrid.from_array(d, (12, 16))).score
-    ),
+    "improvement_scattered": lambda d: improvement_scattered(UV, d[UV[:, 1], UV[:, 0]], PLAIN.shape).raw,
+    "ImprovementSelector": lambda d: ImprovementSelector().select(SeedGrid.from_array(d, (12, 16))).score,
     "NeuralGasSelector": lambda d: (
         NeuralGasSelector(nodes=40).select(SeedGrid.from_array(d, (12, 16))).nodes_mm
     ),

@@ -163,9 +163,7 @@ def test_lattice_and_general_path_agree(depth):
     known = here.known
     np.testing.assert_allclose(here.estimate_mm[known], there.estimate_mm[known], rtol=1e-4)
     np.testing.assert_allclose(here.raw, there.raw, rtol=2e-3, atol=1e-6)
-    np.testing.assert_allclose(
-        here.variance_mm2[known], there.variance_mm2[known], rtol=2e-3, atol=1e-3
-    )
+    np.testing.assert_allclose(here.variance_mm2[known], there.variance_mm2[known], rtol=2e-3, atol=1e-3)
 
 
 def test_threads_change_nothing(shared_data):

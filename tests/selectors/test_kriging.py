@@ -42,9 +42,7 @@ def window(uv, depth, a, b, w, u0, v0, width, height, by_sums=False):
     box = Box(u0, v0, width, height)
     krige_window(samples, count, a, b, between, distances, 0, box, FRAME, scratch, by_sums)
     size = (height + 2) * (width + 2)
-    return [
-        scratch[q][:size].reshape(height + 2, width + 2)[1:-1, 1:-1].astype(float) for q in range(3)
-    ]
+    return [scratch[q][:size].reshape(height + 2, width + 2)[1:-1, 1:-1].astype(float) for q in range(3)]
 
 
 @st.composite
@@ -79,9 +77,7 @@ def test_window_equals_the_published_systems(system):
     off_mm = 1e-3 * np.ptp(depth) + 1e-4 * depth.min()
     np.testing.assert_allclose(z.ravel(), np.maximum(expected_z, floor), rtol=0, atol=off_mm)
     tolerance = 1e-3 * expected_variance.max()
-    np.testing.assert_allclose(
-        variance.ravel(), expected_variance, rtol=1e-3, atol=1e-3 * tolerance + 1e-9
-    )
+    np.testing.assert_allclose(variance.ravel(), expected_variance, rtol=1e-3, atol=1e-3 * tolerance + 1e-9)
     for n in range(0, len(pixels), 7):
         s = pixels[n]
         around = s + np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])

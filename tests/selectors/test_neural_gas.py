@@ -245,9 +245,7 @@ def check_quality(folder: Path, frames: list[tuple[str, int]], side: int, nodes:
         quick = NeuralGasSelector(nodes, seed=0).select(seeds)
         error = quantisation_error(seeds.points_mm, quick.nodes_mm)
         assert error == pytest.approx(quick.quantisation_error_mm, rel=2e-3)
-        assert error <= min(first.quantisation_error_mm, second.quantisation_error_mm), (
-            f"{name} {index}"
-        )
+        assert error <= min(first.quantisation_error_mm, second.quantisation_error_mm), f"{name} {index}"
         among_exact = overlap(first.mask, second.mask)
         with_exact = (overlap(quick.mask, first.mask) + overlap(quick.mask, second.mask)) / 2
         differences.append(among_exact - with_exact)
@@ -492,9 +490,7 @@ def panorama() -> SeedGrid:
         ),
         axis=-1,
     )
-    return SeedGrid.from_array(
-        np.full((64, 512), 3000.0), (32, 128), points_mm=points.astype(np.float32)
-    )
+    return SeedGrid.from_array(np.full((64, 512), 3000.0), (32, 128), points_mm=points.astype(np.float32))
 
 
 @pytest.mark.parametrize("algorithm", ["exact", "fast"])
@@ -511,8 +507,6 @@ def test_nodes_of_a_panorama_lie_at_the_pixels_of_their_seeds(algorithm):
 
 def test_nodes_of_a_camera_are_projected():
     camera = Camera.kinect(160, 120)
-    seeds = SeedGrid.from_frame(
-        DepthFrame(np.full((120, 160), 1000, np.uint16), 0, 0, camera), (30, 40)
-    )
+    seeds = SeedGrid.from_frame(DepthFrame(np.full((120, 160), 1000, np.uint16), 0, 0, camera), (30, 40))
     nodes = seeds.points_mm[::7]
     assert np.allclose(node_pixels(nodes, seeds), seeds.uv[::7], atol=1e-2)

@@ -48,6 +48,4 @@ def test_a_mask_is_filled_evenly_and_before_all_else() -> None:
 
 def test_the_even_selector_heeds_no_depth() -> None:
     one, other = (SeedGrid.from_array(np.full((64, 64), d), (16, 16)) for d in (900, 4000))
-    np.testing.assert_array_equal(
-        EvenSelector().select(one).score, EvenSelector().select(other).score
-    )
+    np.testing.assert_array_equal(EvenSelector().select(one).score, EvenSelector().select(other).score)

@@ -54,9 +54,7 @@ def assert_delaunay(uv: Pixels, mesh: Mesh) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(scattered())
-def test_triangulation_is_delaunay_whatever_the_points(
-    case: tuple[tuple[int, int], Pixels],
-) -> None:
+def test_triangulation_is_delaunay_whatever_the_points(case: tuple[tuple[int, int], Pixels]) -> None:
     _, uv = case
     mesh = Mesh.of(uv)
     centred = (uv - uv[0]).astype(float)
@@ -124,9 +122,7 @@ def test_nearest_sample_of_nothing_says_so() -> None:
     assert (gap_sq == FAR_SQ).all()
 
 
-def candidates(
-    uv: Pixels, depth: npt.NDArray[np.float64], shape: tuple[int, int]
-) -> list[list[set[float]]]:
+def candidates(uv: Pixels, depth: npt.NDArray[np.float64], shape: tuple[int, int]) -> list[list[set[float]]]:
     """All depths that the protocol allows at each pixel, by the letter of its text.
 
     Where two samples are equally near, or triangles share an edge, there is a choice.
@@ -203,9 +199,7 @@ def test_shots_that_missed_and_bad_values_are_left_out() -> None:
 def test_what_is_no_depth_is_no_sample(value: float) -> None:
     uv = np.array([(1, 1), (5, 1), (1, 5)], np.int32)
     depth = np.array([800, 900, value])
-    np.testing.assert_array_equal(
-        reconstruct(uv, depth, (7, 7)), reconstruct(uv[:2], depth[:2], (7, 7))
-    )
+    np.testing.assert_array_equal(reconstruct(uv, depth, (7, 7)), reconstruct(uv[:2], depth[:2], (7, 7)))
 
 
 @pytest.mark.parametrize(
@@ -217,9 +211,7 @@ def test_what_is_no_depth_is_no_sample(value: float) -> None:
         ([(0, 0), (11, 0), (5, 5)], 1000, True),
     ],
 )
-def test_a_bridge_exceeds_both_limits(
-    corners: list[tuple[int, int]], span_mm: float, bridges: bool
-) -> None:
+def test_a_bridge_exceeds_both_limits(corners: list[tuple[int, int]], span_mm: float, bridges: bool) -> None:
     """Just as wide or as long as a limit is still a surface."""
     assert BRIDGE_PX == 10
     depth = np.array([1000, 1000 + span_mm, 1000])

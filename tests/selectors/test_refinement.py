@@ -20,10 +20,7 @@ def flat(lattice: tuple[int, int], shape: tuple[int, int] = (120, 160)) -> SeedG
 
 @example(rows=15, columns=2, shots=4473, seed=0)  # its rows are full long before its columns
 @given(
-    rows=st.integers(1, 40),
-    columns=st.integers(1, 40),
-    shots=st.integers(0, 20_000),
-    seed=st.integers(0, 99),
+    rows=st.integers(1, 40), columns=st.integers(1, 40), shots=st.integers(0, 20_000), seed=st.integers(0, 99)
 )
 @settings(deadline=None)
 def test_new_pixels_are_no_seeds_not_deep_in_holes_and_within_the_budget(
@@ -53,9 +50,7 @@ def test_the_gaps_shrink_as_said(shots: int, steps: int) -> None:
     assert pitch_px == pytest.approx(10 / 2 ** (steps / 2))
     measured = np.concatenate((seeds.lattice_uv.reshape(-1, 2), uv))
     rows, columns = np.mgrid[20:100, 20:140]
-    gaps = np.hypot(columns[..., None] - measured[:, 0], rows[..., None] - measured[:, 1]).min(
-        axis=-1
-    )
+    gaps = np.hypot(columns[..., None] - measured[:, 0], rows[..., None] - measured[:, 1]).min(axis=-1)
     assert gaps.max() <= pitch_px / 2**0.5 + 0.5
 
 

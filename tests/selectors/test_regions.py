@@ -62,9 +62,7 @@ def test_triangulation_is_that_of_qhull(count, seed):
             for other in set(range(len(grid))) - set(triangle.tolist())
         )
         assert not alone or tuple(sorted(triangle.tolist())) in ours
-    area = [
-        abs(np.linalg.det(double[t[:, 1:]] - double[t[:, :1]])).sum() for t in (triangles, theirs)
-    ]
+    area = [abs(np.linalg.det(double[t[:, 1:]] - double[t[:, :1]])).sum() for t in (triangles, theirs)]
     assert area[0] == pytest.approx(area[1], rel=1e-6)
 
 

@@ -50,8 +50,7 @@ def reference(surface: Surface) -> tuple[npt.NDArray[np.float64], npt.NDArray[np
         if np.ptp(z) > STEP_MM and longest > BRIDGE_PX:
             continue
         weights = np.linalg.solve(
-            np.vstack((at.T, np.ones(3))),
-            np.stack((columns.ravel(), rows.ravel(), np.ones(rows.size))),
+            np.vstack((at.T, np.ones(3))), np.stack((columns.ravel(), rows.ravel(), np.ones(rows.size)))
         )
         inside = (weights > -1e-9).all(axis=0).reshape(model.shape)
         model[inside] = (z @ weights).reshape(model.shape)[inside]

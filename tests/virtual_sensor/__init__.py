@@ -68,8 +68,7 @@ def build_driver() -> Path:
             made = Path(folder) / "driver.so"
             flags = ["-shared", "-fPIC", "-O2", "-std=c++17", "-Wall", "-Wextra", "-Werror"]
             subprocess.run(
-                [compiler, *flags, f"-I{HEADERS}", str(SOURCE), "-o", str(made), "-pthread"],
-                check=True,
+                [compiler, *flags, f"-I{HEADERS}", str(SOURCE), "-o", str(made), "-pthread"], check=True
             )
             made.replace(library)
     return library
@@ -88,17 +87,13 @@ class VirtualSensor:
         First settings, as for `set`.
     """
 
-    def __init__(
-        self, folder: Path, frames: npt.NDArray[np.uint16] | None = None, **keys: int
-    ) -> None:
+    def __init__(self, folder: Path, frames: npt.NDArray[np.uint16] | None = None, **keys: int) -> None:
         library = _system_library()
         self.runtime = folder / "runtime"
         drivers = self.runtime / "OpenNI2" / "Drivers"
         drivers.mkdir(parents=True)
         (self.runtime / "libOpenNI2.so").symlink_to(library)
-        (drivers / "libOniFile.so.0").symlink_to(
-            library.parent / "OpenNI2" / "Drivers" / "libOniFile.so.0"
-        )
+        (drivers / "libOniFile.so.0").symlink_to(library.parent / "OpenNI2" / "Drivers" / "libOniFile.so.0")
         (drivers / "libVirtualSensor.so.0").symlink_to(build_driver())
         self._control = folder / "control.txt"
         self._keys: dict[str, int | Path] = {"connected": 1}
@@ -122,9 +117,7 @@ class VirtualSensor:
         fresh.replace(self._control)  # never half a file
 
 
-def record_oni(
-    frames: npt.NDArray[np.uint16], out: Path, *, fps: int = 60, overwrite: bool = True
-) -> None:
+def record_oni(frames: npt.NDArray[np.uint16], out: Path, *, fps: int = 60, overwrite: bool = True) -> None:
     """Make an `.oni` that holds exactly these frames, through the real OpenNI2 recorder.
 
     Parameters
@@ -148,9 +141,7 @@ def record_oni(
         sensor = VirtualSensor(Path(folder), frames, fps=fps, limit=count)
         os.environ.update(sensor.env)
         try:
-            report = record(
-                out, frames=count, settings=DeviceSettings(width, height), overwrite=overwrite
-            )
+            report = record(out, frames=count, settings=DeviceSettings(width, height), overwrite=overwrite)
         finally:
             for key in sensor.env:
                 os.environ.pop(key)

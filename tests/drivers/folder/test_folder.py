@@ -77,8 +77,7 @@ def test_tum_folder_uses_its_list_scale_and_sequence(tmp_path: Path, inner: str)
     _png(root / "depth" / "1311.3.png", raw)
     _png(root / "depth" / "not-listed.png", _depth())
     (root / "depth.txt").write_text(
-        "# depth maps\n# timestamp filename\n1311.300000 depth/1311.3.png\n"
-        "\n1311.400000 depth/1311.1.png\n"
+        "# depth maps\n# timestamp filename\n1311.300000 depth/1311.3.png\n\n1311.400000 depth/1311.1.png\n"
     )
     with RecordedFolder(root / inner) as folder:
         assert (folder.layout, folder.frame_count) == ("TUM", 2)
@@ -91,9 +90,7 @@ def test_tum_folder_uses_its_list_scale_and_sequence(tmp_path: Path, inner: str)
     np.testing.assert_array_equal(first.depth_mm[0, :4], [0, 1000, 13107, 2])
 
 
-def test_seven_scenes_folder_takes_only_its_depth_and_drops_the_invalid_mark(
-    tmp_path: Path,
-) -> None:
+def test_seven_scenes_folder_takes_only_its_depth_and_drops_the_invalid_mark(tmp_path: Path) -> None:
     raw = np.array([[65535, 1200], [0, 65534]], np.uint16)
     _png(tmp_path / "frame-000001.depth.png", raw)
     _png(tmp_path / "frame-000000.depth.png", raw)
@@ -189,8 +186,7 @@ def test_frames_before_a_damaged_one_stay_good(tmp_path: Path) -> None:
 def test_what_is_written_is_read_back_bit_by_bit(tmp_path: Path) -> None:
     camera = Camera(8, 6, 7.25, 7.5, 3.9, 2.8)
     frames = [
-        DepthFrame(_depth(seed=number), number, 10**15 + 33_366 * number, camera)
-        for number in range(3)
+        DepthFrame(_depth(seed=number), number, 10**15 + 33_366 * number, camera) for number in range(3)
     ]
     out = tmp_path / "neü er" / "folder"
     assert write_folder(out, frames, fps=29.97) == 3
@@ -223,9 +219,7 @@ def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
         FolderWriter(tmp_path / "file" / "inside")
 
 
-def test_a_full_disk_leaves_a_readable_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_leaves_a_readable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writer = FolderWriter(tmp_path / "full")
     camera = Camera.kinect(8, 6)
     writer.write(DepthFrame(_depth(), 0, 0, camera))
@@ -264,9 +258,7 @@ def test_an_empty_folder_says_what_was_looked_for(tmp_path: Path) -> None:
 
 def test_a_folder_one_level_too_high_names_the_right_one(tmp_path: Path) -> None:
     _png(tmp_path / "take1" / "0.png")
-    with pytest.raises(
-        SourceNotFoundError, match=r"take1' holds PNG files \(1\): give that folder"
-    ):
+    with pytest.raises(SourceNotFoundError, match=r"take1' holds PNG files \(1\): give that folder"):
         RecordedFolder(tmp_path)
 
 
@@ -339,10 +331,7 @@ def test_a_pipe_in_the_folder_does_not_hang(tmp_path: Path) -> None:
 def test_a_claim_of_gigantic_size_allocates_nothing(tmp_path: Path) -> None:
     header = b"IHDR" + struct.pack(">IIBBBBB", 2**31 - 1, 2**31 - 1, 16, 0, 0, 0, 0)
     (tmp_path / "0.png").write_bytes(
-        b"\x89PNG\r\n\x1a\n"
-        + struct.pack(">I", 13)
-        + header
-        + struct.pack(">I", zlib.crc32(header))
+        b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
     )
     with pytest.raises(DamagedRecordingError, match="2147483647x2147483647"):
         RecordedFolder(tmp_path)
@@ -393,21 +382,13 @@ def test_a_wrong_line_of_a_tum_list_is_shown(tmp_path: Path, line: str) -> None:
         ("timestamps_us = [1, 2]", "holds 1 frames, but .* lists 2 timestamps"),
         ("camera = 3", "camera.*a table of exactly width"),
         ("[camera]\nwidth = 8", "camera.*a table of exactly width"),
-        (
-            "[camera]\nwidth = 8\nheight = 6\nfx = 0\nfy = 1\ncx = 1\ncy = 1",
-            "camera.*focal length fx is 0",
-        ),
-        (
-            "[camera]\nwidth = 8.5\nheight = 6\nfx = 1\nfy = 1\ncx = 1\ncy = 1",
-            "width.*whole number",
-        ),
+        ("[camera]\nwidth = 8\nheight = 6\nfx = 0\nfy = 1\ncx = 1\ncy = 1", "camera.*focal length fx is 0"),
+        ("[camera]\nwidth = 8.5\nheight = 6\nfx = 1\nfy = 1\ncx = 1\ncy = 1", "width.*whole number"),
         ("fps = 0x" + "f" * 5000, "too long to print"),
         ("a = " + "[" * 5000, "TOML"),
     ],
 )
-def test_a_wrong_sidecar_names_the_entry_and_what_is_allowed(
-    tmp_path: Path, text: str, message: str
-) -> None:
+def test_a_wrong_sidecar_names_the_entry_and_what_is_allowed(tmp_path: Path, text: str, message: str) -> None:
     _png(tmp_path / "0.png")
     (tmp_path / SIDECAR).write_text(text)
     with pytest.raises(DamagedRecordingError, match=message):
@@ -437,9 +418,7 @@ _VALUES = st.recursive(
     | st.sampled_from([6, 8]),
     lambda inner: (
         st.lists(inner, max_size=3)
-        | st.dictionaries(
-            st.sampled_from(["width", "height", "fx", "fy", "cx", "cy"]), inner, min_size=5
-        )
+        | st.dictionaries(st.sampled_from(["width", "height", "fx", "fy", "cx", "cy"]), inner, min_size=5)
     ),
     max_leaves=8,
 )
@@ -447,9 +426,7 @@ _VALUES = st.recursive(
 
 @settings(max_examples=200, deadline=None)
 @given(
-    entries=st.dictionaries(
-        st.sampled_from([*Sidecar.__dataclass_fields__, "other"]), _VALUES, max_size=5
-    )
+    entries=st.dictionaries(st.sampled_from([*Sidecar.__dataclass_fields__, "other"]), _VALUES, max_size=5)
 )
 def test_any_toml_as_sidecar_opens_the_folder_or_gives_a_named_error(
     tmp_path_factory: pytest.TempPathFactory, entries: dict[str, object]
@@ -484,10 +461,7 @@ def _toml(value: object) -> str:
     mend=st.booleans(),
 )
 def test_any_damaged_png_gives_its_frame_or_a_named_error(
-    tmp_path_factory: pytest.TempPathFactory,
-    changes: list[tuple[int, int]],
-    cut: int | None,
-    mend: bool,
+    tmp_path_factory: pytest.TempPathFactory, changes: list[tuple[int, int]], cut: int | None, mend: bool
 ) -> None:
     folder = tmp_path_factory.getbasetemp() / "any-png"
     source = folder / "whole.png"
@@ -543,9 +517,7 @@ def test_names_whose_two_readings_agree_are_no_matter(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["out.oni", "out"])
-def test_a_clock_that_wraps_is_named_and_leaves_nothing_in_the_way(
-    tmp_path: Path, name: str
-) -> None:
+def test_a_clock_that_wraps_is_named_and_leaves_nothing_in_the_way(tmp_path: Path, name: str) -> None:
     times_us = [4294917295, 4294950628, 16666]
     frames = [
         DepthFrame(_depth(6, 8), index, time_us, Camera.kinect(8, 6))

@@ -70,9 +70,7 @@ def disparities(mm: Values) -> Values:
 def listing(root: Path, name: str = "depth.txt") -> None:
     pairs = [f"{stamp} depth/{stamp}.png" for stamp in STAMPS]
     if name != "depth.txt":
-        pairs = [
-            f"{stamp} rgb/{stamp}.png {pair}" for stamp, pair in zip(STAMPS, pairs, strict=True)
-        ]
+        pairs = [f"{stamp} rgb/{stamp}.png {pair}" for stamp, pair in zip(STAMPS, pairs, strict=True)]
     (root / name).write_text("# a list\n" + "\n".join(pairs) + "\n")
 
 
@@ -107,10 +105,7 @@ def meta(root: Path) -> None:
 
 
 BOP = json.dumps(
-    {
-        str(n): {"cam_K": [577.5, 0, 318.75, 0, 578.25, 242.5, 0, 0, 1], "depth_scale": 0.1}
-        for n in range(3)
-    }
+    {str(n): {"cam_K": [577.5, 0, 318.75, 0, 578.25, 242.5, 0, 0, 1], "depth_scale": 0.1} for n in range(3)}
 )
 INFO = (
     "m_versionNumber = 4\nm_depthWidth = 640\nm_depthHeight = 480\nm_depthShift = 1000\n"
@@ -144,16 +139,7 @@ class Row:
 ROWS = [
     Row("plain", "any", "{number}.png", Camera.kinect()),
     Row("plain", "by_time", "{stamp}.png", Camera.kinect(), times_us=STAMPS_US),
-    Row(
-        "TUM",
-        "rgbd_freiburg2_x",
-        BY_STAMP,
-        FREIBURG2,
-        at_scale(5000),
-        listing,
-        STAMPS_US,
-        scale="5000",
-    ),
+    Row("TUM", "rgbd_freiburg2_x", BY_STAMP, FREIBURG2, at_scale(5000), listing, STAMPS_US, scale="5000"),
     Row("TUM", "my_room", BY_STAMP, XTION, at_scale(5000), listing, STAMPS_US, scale="5000"),
     Row(
         "TUM",
@@ -175,16 +161,7 @@ ROWS = [
         EVEN_US,
         scale="5000",
     ),
-    Row(
-        "Bonn",
-        "rgbd_bonn_balloon",
-        BY_STAMP,
-        BONN,
-        at_scale(5000),
-        listing,
-        STAMPS_US,
-        scale="5000",
-    ),
+    Row("Bonn", "rgbd_bonn_balloon", BY_STAMP, BONN, at_scale(5000), listing, STAMPS_US, scale="5000"),
     Row(
         "ETH3D",
         "plant_1",
@@ -202,9 +179,7 @@ ROWS = [
         "depth/{number:07d}-{us:012d}.png",
         OWN,
         rotated,
-        files(
-            text("intrinsics.txt", "577.5 0 318.75\n0 578.25 242.5\n0 0 1\n"), beside("image/1.jpg")
-        ),
+        files(text("intrinsics.txt", "577.5 0 318.75\n0 578.25 242.5\n0 0 1\n"), beside("image/1.jpg")),
         NAMED_US,
         scale="its own",
     ),
@@ -271,9 +246,7 @@ ROWS = [
         "41069021",
         "lowres_depth/41069021_{stamp}.png",
         OWN,
-        beside=text(
-            "lowres_wide_intrinsics/41069021_0.pincam", "640 480 577.5 578.25 318.75 242.5"
-        ),
+        beside=text("lowres_wide_intrinsics/41069021_0.pincam", "640 480 577.5 578.25 318.75 242.5"),
         times_us=STAMPS_US,
     ),
     Row(
@@ -298,13 +271,7 @@ ROWS = [
     ),
     Row("Open3D / RealSense", "dataset", NUMBERED, OWN, beside=open3d("camera_intrinsic.json")),
     Row("Open3D / Azure Kinect", "azure", NUMBERED, OWN, beside=open3d("intrinsic.json")),
-    Row(
-        "BundleFusion",
-        "copyroom",
-        "frame-{number:06d}.depth.png",
-        OWN,
-        beside=text("info.txt", INFO),
-    ),
+    Row("BundleFusion", "copyroom", "frame-{number:06d}.depth.png", OWN, beside=text("info.txt", INFO)),
     Row(
         "3DMatch",
         "seq-01",
@@ -344,9 +311,7 @@ def make(row: Row, folder: Path, scene: list[Values]) -> Path:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.layout}-{row.root}")
-def test_a_layout_is_read_as_its_publisher_means_it(
-    tmp_path: Path, scene: list[Values], row: Row
-) -> None:
+def test_a_layout_is_read_as_its_publisher_means_it(tmp_path: Path, scene: list[Values], row: Row) -> None:
     root = make(row, tmp_path, scene)
     inside = root / Path(row.image).parent
     for path in {root, inside}:
@@ -371,9 +336,7 @@ def test_every_layout_has_a_row_here() -> None:
     assert {row.layout for row in ROWS} == {layout.name for layout in LAYOUTS}
 
 
-@pytest.mark.parametrize(
-    "name", ["frame-000000.depth.png", "frames/depth/Camera_0/depth_00000.png"]
-)
+@pytest.mark.parametrize("name", ["frame-000000.depth.png", "frames/depth/Camera_0/depth_00000.png"])
 def test_a_layouts_mark_of_nothing_is_nothing(tmp_path: Path, name: str) -> None:
     raw = np.full((480, 640), 300, np.uint16)
     raw[0] = 65535
@@ -412,18 +375,14 @@ def test_intrinsics_of_another_image_are_questioned(tmp_path: Path, scene: list[
 
 
 @pytest.mark.parametrize("content", ["", "fx fy", "{", '{"0": 1}'])
-def test_intrinsics_of_an_unknown_form_are_named(
-    tmp_path: Path, scene: list[Values], content: str
-) -> None:
+def test_intrinsics_of_an_unknown_form_are_named(tmp_path: Path, scene: list[Values], content: str) -> None:
     root = make(ROWS[0], tmp_path, scene)
     (root / "intrinsic.json").write_text(content)
     with pytest.raises(DamagedRecordingError, match=r"intrinsic\.json' holds no intrinsics"):
         open_source(root)
 
 
-def test_values_that_are_hardly_millimetres_are_questioned(
-    tmp_path: Path, scene: list[Values]
-) -> None:
+def test_values_that_are_hardly_millimetres_are_questioned(tmp_path: Path, scene: list[Values]) -> None:
     root = make(Row("plain", "deci", "{number}.png", OWN, at_scale(10_000)), tmp_path, scene)
     with open_source(root) as folder:
         assert "give --scale VALUES_PER_METRE" in folder.notes[0]
@@ -521,9 +480,7 @@ def test_a_damaged_pgm_is_named(tmp_path: Path, content: bytes) -> None:
         ("rgbdscenes2/scene_01", "RGB-D Scenes v2", 570.3, 0),
     ],
 )
-def test_a_case_is_right(
-    shared_cases: Path, folder: str, layout: str, fx: float, first_us: int
-) -> None:
+def test_a_case_is_right(shared_cases: Path, folder: str, layout: str, fx: float, first_us: int) -> None:
     with open_source(shared_cases / "folders" / folder) as source:
         assert isinstance(source, RecordedFolder)
         assert (source.layout, source.camera.fx) == (layout, fx)

@@ -25,13 +25,7 @@ from selective_depth.drivers.oni.records import (
     pack_property,
     pack_record,
 )
-from selective_depth.drivers.oni.writer import (
-    Property,
-    RecordWriter,
-    depth_properties,
-    integer,
-    structure,
-)
+from selective_depth.drivers.oni.writer import Property, RecordWriter, depth_properties, integer, structure
 from selective_depth.drivers.open import open_source
 
 Depth = npt.NDArray[np.uint16]
@@ -83,9 +77,7 @@ def mirrored(frames: list[Depth]) -> list[Depth]:
     return [np.ascontiguousarray(mm[:, ::-1]) for mm in frames]
 
 
-def test_a_mirrored_recording_is_delivered_the_right_way_round(
-    tmp_path: Path, scene: list[Depth]
-) -> None:
+def test_a_mirrored_recording_is_delivered_the_right_way_round(tmp_path: Path, scene: list[Depth]) -> None:
     path = write(tmp_path / "a.oni", mirrored(scene), xnMirror=integer(1))
     same(delivered(path), scene)
     report = inspect_oni(path)
@@ -125,11 +117,7 @@ def test_a_crop_shifts_the_camera(tmp_path: Path, scene: list[Depth]) -> None:
     same(delivered(path), cropped)
     with open_source(path) as source:
         assert (source.camera.width, source.camera.height) == (40, 40)
-        assert (source.camera.fx, source.camera.cx, source.camera.cy) == (
-            pytest.approx(73.0),
-            20.0,
-            20.0,
-        )
+        assert (source.camera.fx, source.camera.cx, source.camera.cy) == (pytest.approx(73.0), 20.0, 20.0)
     repair_oni(path, tmp_path / "b.oni")
     same(delivered(tmp_path / "b.oni"), cropped)
 
@@ -245,12 +233,7 @@ def test_a_pointer_of_git_lfs_is_named(tmp_path: Path) -> None:
     ],
 )
 def test_check_and_replay_of_a_case_agree(
-    shared_cases: Path,
-    capsys: pytest.CaptureFixture[str],
-    name: str,
-    frames: int,
-    check_code: int,
-    said: str,
+    shared_cases: Path, capsys: pytest.CaptureFixture[str], name: str, frames: int, check_code: int, said: str
 ) -> None:
     path = shared_cases / "oni" / name
     assert run(["check", str(path)]) == check_code
@@ -279,9 +262,7 @@ def _of(cases: Path, name: str) -> list[Depth]:
         ("crop.oni", lambda mm: mm[60:300, 100:420]),
     ],
 )
-def test_the_cases_show_the_same_scene(
-    shared_cases: Path, name: str, made: Callable[[Depth], Depth]
-) -> None:
+def test_the_cases_show_the_same_scene(shared_cases: Path, name: str, made: Callable[[Depth], Depth]) -> None:
     """All were made of the frames of the clock's case, whose side and size are plain."""
     right = [made(mm) for mm in _of(shared_cases, "wrap.oni")]
     for got in _of(shared_cases, name):

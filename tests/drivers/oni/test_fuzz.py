@@ -77,9 +77,7 @@ def _fuzz(sound: bytes, folder: Path, *, mutated: int, cut: int, seed: int) -> C
     return counts
 
 
-def _replay_repaired(
-    sound: bytes, folder: Path, *, mutated: int, cut: int, seed: int
-) -> Counter[str]:
+def _replay_repaired(sound: bytes, folder: Path, *, mutated: int, cut: int, seed: int) -> Counter[str]:
     """Repair damaged files and give what comes out to OpenNI2; return how many fared how."""
     damaged, repaired = folder / "damaged.oni", folder / "repaired.oni"
     names: list[str] = []
@@ -145,9 +143,7 @@ def _timed(name: str, path: Path, *, decode: bool) -> bool:
     return openable
 
 
-def _deliver_timed(
-    name: str, path: Path, opened: type[OniReader] | object
-) -> tuple[list[DepthFrame], str]:
+def _deliver_timed(name: str, path: Path, opened: type[OniReader] | object) -> tuple[list[DepthFrame], str]:
     start = time.monotonic()
     try:
         result = _deliver(opened(path))  # type: ignore[operator]

@@ -27,14 +27,7 @@ from selective_depth.drivers.errors import (
 )
 from selective_depth.drivers.folder import RecordedFolder
 from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.drivers.oni import (
-    OniReader,
-    OniReport,
-    export_oni,
-    inspect_oni,
-    mend_oni,
-    repair_oni,
-)
+from selective_depth.drivers.oni import OniReader, OniReport, export_oni, inspect_oni, mend_oni, repair_oni
 from selective_depth.drivers.oni.codec import encode_depth
 from selective_depth.drivers.oni.inspection import _Inspection
 from selective_depth.drivers.oni.records import (
@@ -176,9 +169,7 @@ def test_what_openni2s_recorder_swaps_is_read_rightly_and_can_be_mended_in_place
 
 
 @pytest.mark.openni
-def test_a_killed_recording_of_the_real_recorder_comes_back(
-    tmp_path: Path, oni_sample: OniSample
-) -> None:
+def test_a_killed_recording_of_the_real_recorder_comes_back(tmp_path: Path, oni_sample: OniSample) -> None:
     """As the recorder leaves it: no end, no frame count, no seek table, half a frame."""
     data = bytearray(oni_sample.path.read_bytes())
     frame = inspect_oni(oni_sample.path).depth.frames[8]  # type: ignore[union-attr]
@@ -194,9 +185,7 @@ def test_a_killed_recording_of_the_real_recorder_comes_back(
     out = repair_oni(path, tmp_path / "out.oni")
     assert out.complete and out.readable_frames == 8
     for file in (path, tmp_path / "out.oni"):
-        np.testing.assert_array_equal(
-            [frame.depth_mm for frame in _read(file)], oni_sample.depth_mm[:8]
-        )
+        np.testing.assert_array_equal([frame.depth_mm for frame in _read(file)], oni_sample.depth_mm[:8])
 
 
 def test_without_the_runtime_a_recording_opens_all_the_same(
@@ -353,9 +342,7 @@ def test_a_frame_that_cannot_be_decoded_ends_the_replay_with_its_place(recording
     with OniReader(recording) as reader:
         reader.read()
         for _ in range(2):
-            with pytest.raises(
-                DamagedRecordingError, match=f"byte {frame.record_offset}: frame 2 cannot"
-            ):
+            with pytest.raises(DamagedRecordingError, match=f"byte {frame.record_offset}: frame 2 cannot"):
                 reader.read()
 
 
@@ -439,9 +426,7 @@ def test_every_wrong_number_is_found_and_named(
         ("oniPixelFormat", (200).to_bytes(8, "little"), "have format 200"),
     ],
 )
-def test_a_wrong_property_is_named(
-    tmp_path: Path, name: str, value: bytes | None, sentence: str
-) -> None:
+def test_a_wrong_property_is_named(tmp_path: Path, name: str, value: bytes | None, sentence: str) -> None:
     properties = depth_properties(CAMERA, 30)
     kind = properties.pop(name)[0]
     if value is not None:
@@ -472,9 +457,7 @@ def _write(
 ) -> None:
     """A recording of a colour and a depth stream, interleaved."""
     writer = RecordWriter(path)
-    writer.add_node(
-        1, NodeAddition("Image", NodeType.IMAGE, b"JPEG", None, 0), {"Gain": integer(3)}
-    )
+    writer.add_node(1, NodeAddition("Image", NodeType.IMAGE, b"JPEG", None, 0), {"Gain": integer(3)})
     writer.add_node(2, NodeAddition("Depth", NodeType.DEPTH, codec, None, 0), properties)
     writer.begin()
     for frame in _frames():
@@ -513,9 +496,7 @@ def test_files_of_openni_1_are_read_and_brought_up_to_date(tmp_path: Path) -> No
 
     def add(kind: Kind, fields: bytes = b"", payload: bytes = b"") -> None:
         out.extend(
-            OLD_HEADER.pack(MAGIC, kind, 1, OLD_HEADER.size + len(fields), len(payload), 0)
-            + fields
-            + payload
+            OLD_HEADER.pack(MAGIC, kind, 1, OLD_HEADER.size + len(fields), len(payload), 0) + fields + payload
         )
 
     add(Kind.NODE_ADDED_4, b"\x07\0\0\0Depth1\0" + struct.pack("<I4s", NodeType.DEPTH, b"16zT"))

@@ -440,23 +440,13 @@ while True:
 
 @pytest.mark.parametrize(
     "end",
-    [
-        "exit",
-        "exception",
-        "killed while its fork lives on",
-        signal.SIGINT,
-        signal.SIGTERM,
-        signal.SIGKILL,
-    ],
+    ["exit", "exception", "killed while its fork lives on", signal.SIGINT, signal.SIGTERM, signal.SIGKILL],
 )
 def test_nothing_is_left_whichever_way_the_program_ends(
     virtual_sensor: VirtualSensor, end: str | signal.Signals
 ) -> None:
     with subprocess.Popen(
-        [sys.executable, "-c", READER, str(end)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
+        [sys.executable, "-c", READER, str(end)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as program:
         assert program.stdout is not None
         worker = int(program.stdout.readline())

@@ -74,9 +74,7 @@ def test_frames_whose_last_pixel_differs_replay_bit_for_bit(
             np.testing.assert_array_equal(frame.depth_mm, frames[index % 4])
 
 
-def test_frames_that_cannot_be_decoded_are_told(
-    virtual_sensor: VirtualSensor, tmp_path: Path
-) -> None:
+def test_frames_that_cannot_be_decoded_are_told(virtual_sensor: VirtualSensor, tmp_path: Path) -> None:
     def disturb(frames: int) -> None:
         if frames == 6:
             virtual_sensor.set(odd=1)  # frames of half the height, which are recorded as well
@@ -207,9 +205,7 @@ def test_an_older_recording_is_replaced_only_once_the_sensor_streams(
     assert len(images(out)) >= 3
 
 
-def test_without_the_runtime_no_file_is_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_runtime_no_file_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENNI2_REDIST", str(tmp_path))
     with pytest.raises(RuntimeMissingError):
         record(tmp_path / "out.oni")

@@ -15,22 +15,9 @@ from selective_depth.drivers.openni.process import Message
 
 FOUND: Message = {
     "kind": "found",
-    "device": {
-        "uri": "script",
-        "vendor": "",
-        "name": "a script",
-        "usb_vendor_id": 0,
-        "usb_product_id": 0,
-    },
+    "device": {"uri": "script", "vendor": "", "name": "a script", "usb_vendor_id": 0, "usb_product_id": 0},
 }
-OPENED: Message = {
-    "kind": "opened",
-    "width": 8,
-    "height": 6,
-    "fps": 30,
-    "fov_x_rad": 1.0,
-    "fov_y_rad": 0.8,
-}
+OPENED: Message = {"kind": "opened", "width": 8, "height": 6, "fps": 30, "fov_x_rad": 1.0, "fov_y_rad": 0.8}
 OPENS = (FOUND, OPENED)
 MISFIT: Message = {"kind": "misfit", "problem": "4x3 pixels"}
 DIED: Message = {"kind": "died", "reason": "crashed"}
@@ -111,9 +98,7 @@ def test_attempts_are_counted_anew_once_frames_come(
     assert np.all(pauses_s < 5)
 
 
-def test_a_lost_sensor_that_is_there_again_is_reconnecting(
-    play: Callable[..., OpenNIDevice],
-) -> None:
+def test_a_lost_sensor_that_is_there_again_is_reconnecting(play: Callable[..., OpenNIDevice]) -> None:
     seen: list[tuple[str, str]] = []
 
     def look() -> None:

@@ -54,9 +54,7 @@ def ply_bytes(points, faces=(), form="ascii", scalar="double", extra=False) -> b
         texts = (" ".join(repr(value) for _, value in row) for row in rows)
         return header + ("\n".join(texts) + "\n").encode()
     order = "<" if form == "binary_little_endian" else ">"
-    return header + b"".join(
-        struct.pack(order + kind, value) for row in rows for kind, value in row
-    )
+    return header + b"".join(struct.pack(order + kind, value) for row in rows for kind, value in row)
 
 
 def fans(faces) -> list[tuple[int, int, int]]:
@@ -147,10 +145,7 @@ HEADER = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty fl
         (HEADER + "property float z\nend_header\n1 2 1e300\n", "beyond 1e"),
         (HEADER + "property float z\nend_header\n1 2 three\n", "something else than numbers"),
         (HEADER + "property string z\nend_header\n1 2 3\n", "property string z"),
-        (
-            HEADER.replace("1\np", "99999999999\np") + "end_header\n1 2\n",
-            "ends within its 99999999999 rows",
-        ),
+        (HEADER.replace("1\np", "99999999999\np") + "end_header\n1 2\n", "ends within its 99999999999 rows"),
         (
             HEADER + "property float z\nelement face 1\nproperty list uchar int vertex_indices\n"
             "end_header\n1 2 3\n3 0 1 0\n",

@@ -234,9 +234,7 @@ def test_neighbours_share_part_of_their_error():
 
 
 def test_errors_of_two_frames_have_nothing_in_common():
-    errors = [
-        in_steps(measured(wall(2005), seed=k)[:, :-9].astype(float)) for k in (1, 2, 3, 2**32)
-    ]
+    errors = [in_steps(measured(wall(2005), seed=k)[:, :-9].astype(float)) for k in (1, 2, 3, 2**32)]
     likeness = np.corrcoef([error.ravel() for error in errors])
     assert np.abs(likeness - np.eye(4)).max() < 0.03
 
