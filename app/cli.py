@@ -15,7 +15,6 @@ from selective_depth.app.console import dispatch
 from selective_depth.app.console.command import PROGRAM, command
 from selective_depth.app.settings import (
     AcquireOptions,
-    Count,
     Flag,
     GasOptions,
     ImprovementOptions,
@@ -279,83 +278,15 @@ def snapshot(
 
 @command(
     "Pictures",
-    (f"{PROGRAM} epochs bunny.ply", "the paper's Fig. 1, to epochs.png"),
-    (f"{PROGRAM} epochs bunny.ply?side=left --save epochs.rrd", "and on an epoch timeline"),
-)
-def epochs(
-    source: Source,
-    /,
-    out: Annotated[Path, arg(metavar="FILE")] = Path("epochs.png"),
-    save: Annotated[Path | None, optional("FILE.rrd")] = None,
-    frame: Natural = 0,
-    seed: Natural = 0,
-    page: Page = PAGE,
-) -> int:
-    """Show neural gas after 5, 10, 25, 40, 60 and 100 epochs of one frame.
-
-    Parameters
-    ----------
-    source : str
-        An object as .ply, or anything else that 'replay' takes.
-    out : Path
-        The picture to make, .png, .webp, .pdf or .svg.
-    save : Path
-        Write a Rerun recording as well, by epoch.
-    frame : int
-        Which frame of the source, from 0.
-    seed : int
-        Seed of the random draws.
-    page
-        The page.
-    """
-    from selective_depth.app.commands.figures import draw_epochs
-
-    return draw_epochs(source, out, save=save, number=frame, seed=seed, page=page)
-
-
-@command("Pictures", (f"{PROGRAM} densities bunny.ply", "the paper's Fig. 2, to densities.png"))
-def densities(
-    source: Source,
-    /,
-    out: Annotated[Path, arg(metavar="FILE")] = Path("densities.png"),
-    frame: Natural = 0,
-    epochs: Count = 50,
-    seed: Natural = 0,
-    page: Page = PAGE,
-) -> int:
-    """Show what neural gas finds from first scans of 32x32, 40x40, 64x64 and 75x75 points.
-
-    Parameters
-    ----------
-    source : str
-        An object as .ply, or anything else that 'replay' takes.
-    out : Path
-        The picture to make, .png, .webp, .pdf or .svg.
-    frame : int
-        Which frame of the source, from 0.
-    epochs : int
-        Training length.
-    seed : int
-        Seed of the random draws.
-    page
-        The page.
-    """
-    from selective_depth.app.commands.figures import draw_densities
-
-    return draw_densities(source, out, number=frame, epochs=epochs, seed=seed, page=page)
-
-
-@command(
-    "Pictures",
     (f"{PROGRAM} figure 5", "both selectors on the three scenes, to figure-5.png"),
     (f"{PROGRAM} figure 1 bunny.ply --out fig1.pdf", "neural gas by epochs, of your own object"),
-    (f"{PROGRAM} figure 5 frames/ --preset paper", "with the paper's own options"),
 )
 def figure(
     number: Annotated[Literal[1, 2, 4, 5], arg(metavar="1|2|4|5")],
     sources: Annotated[tuple[str, ...], optional("SOURCE...")] = (),
     /,
     out: Annotated[Path | None, optional("FILE")] = None,
+    save: Annotated[Path | None, optional("FILE.rrd")] = None,
     frame: Natural = 0,
     seeds: SeedOptions = DEFAULTS.seeds,
     gas: GasOptions = DEFAULTS.gas,
@@ -375,6 +306,8 @@ def figure(
         As for replay; by default the three virtual scenes, of which 1 and 2 take the first.
     out : Path
         The picture to make, .png, .webp, .pdf or .svg; by default figure-N.png.
+    save : Path
+        Write the trainings of figure 1 to a Rerun recording as well, by epoch.
     frame : int
         Which frame of each source, from 0.
     seeds, gas, improvement
@@ -385,7 +318,7 @@ def figure(
     from selective_depth.app.commands.paper import draw_figure
 
     settings = Settings(seeds=seeds, gas=gas, improvement=improvement)
-    return draw_figure(number, sources or SCENES, out, frame, settings, page)
+    return draw_figure(number, sources or SCENES, out, frame, settings, page, save)
 
 
 @command("Pictures", (f"{PROGRAM} table 1", "computing times on the three scenes, as in the paper"))

@@ -23,7 +23,9 @@ def optional(metavar: str) -> Any:
     return arg(metavar=metavar, help_behavior_hint="")
 
 
-def must_be(allowed: str, kind: Callable[[str], Any], good: Callable[[Any], object]) -> Any:
+def must_be(
+    allowed: str, kind: Callable[[str], Any], good: Callable[[Any], object], *, several: bool = False
+) -> Any:
     """Describe what an option's value must be; anything else is refused in a sentence.
 
     Parameters
@@ -34,10 +36,11 @@ def must_be(allowed: str, kind: Callable[[str], Any], good: Callable[[Any], obje
         Makes the value of what was typed, or raises ValueError.
     good : callable
         Whether the value is allowed.
+    several : bool, default False
+        Whether any number of them may be given; they become a tuple.
     """
 
-    def value_of(words: list[str]) -> Any:
-        typed = words[0]
+    def value_of(typed: str) -> Any:
         try:
             value = kind(typed)
         except ValueError:
@@ -48,11 +51,11 @@ def must_be(allowed: str, kind: Callable[[str], Any], good: Callable[[Any], obje
         return value
 
     return PrimitiveConstructorSpec(
-        nargs=1,
+        nargs="*" if several else 1,
         metavar="N" if kind is int else kind.__name__.upper(),
-        instance_from_str=value_of,
+        instance_from_str=lambda words: tuple(map(value_of, words)) if several else value_of(words[0]),
         is_instance=lambda value: True,
-        str_from_instance=lambda value: [str(value)],
+        str_from_instance=lambda value: [*map(str, value)] if several else [str(value)],
     )
 
 
@@ -72,7 +75,9 @@ def _share(typed: str) -> float:
     return float(typed[:-1]) / 100 if typed.endswith("%") else float(typed)
 
 
-Share = Annotated[float, must_be("a share between 0 and 1, or of 100%", _share, lambda x: 0 <= x <= 1)]
+_A_SHARE = ("a share between 0 and 1, or of 100%", _share, lambda x: 0 <= x <= 1)
+Share = Annotated[float, must_be(*_A_SHARE)]
+Shares = Annotated[tuple[float, ...], must_be(*_A_SHARE, several=True), arg(metavar="SHARE...")]
 positive = must_be("more than 0", float, lambda x: 0 < x < float("inf"))
 Positive = Annotated[float, positive]
 TimeLimit = Annotated[float | None, positive, optional("SECONDS")]
@@ -199,7 +204,7 @@ class ComparisonOptions:
     """Take every N-th frame."""
     frames: Limit = None
     """Take at most N frames of each source."""
-    budget: Annotated[tuple[Share, ...], arg(metavar="SHARE...")] = (0.05, 0.10)
+    budget: Shares = (0.05, 0.10)
     """Further measurements as shares of the frame's pixels."""
     rounds: Rounds = 8
     """Rounds of the closed loops."""

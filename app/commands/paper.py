@@ -34,6 +34,7 @@ def draw_figure(
     frame: int,
     settings: Settings,
     page: PictureOptions,
+    save: Path | None = None,
 ) -> int:
     """Make a figure of the paper of some sources; returns the exit code.
 
@@ -48,7 +49,7 @@ def draw_figure(
     check_picture(path)
     gas = settings.gas
     if number == 1:
-        return draw_epochs(sources[0], path, save=None, number=frame, seed=gas.seed, page=page)
+        return draw_epochs(sources[0], path, save=save, number=frame, seed=gas.seed, page=page)
     if number == 2:
         return draw_densities(sources[0], path, number=frame, epochs=gas.epochs, seed=gas.seed, page=page)
     if number == 4:

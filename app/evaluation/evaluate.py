@@ -28,7 +28,7 @@ from selective_depth.app.settings import Settings
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
-from selective_depth.selectors.acquire import MOST_ROUNDS, shots_of
+from selective_depth.selectors.acquire import shots_of
 from selective_depth.selectors.parallel import default_threads
 from selective_depth.selectors.quality import errors_of
 from selective_depth.selectors.reconstruct import reconstruct
@@ -38,7 +38,7 @@ ENDLESS_FRAMES = 120
 
 Results = dict[str, dict[str, dict[str, float]]]
 """Budget -> strategy -> figure, as the JSON file has it."""
-_Arguments = tuple[Sequence[float], int, tuple[int, int], int, Sequence[str], Settings]
+_Arguments = tuple[Sequence[float], int, int, Sequence[str], Settings]
 
 
 @dataclass(frozen=True)
@@ -108,11 +108,11 @@ def _evaluate_frame(
     frame: DepthFrame,
     budgets: Sequence[float],
     rounds: int,
-    seeds_shape: tuple[int, int],
     random_seeds: int,
     strategies: Sequence[str],
     settings: Settings,
 ) -> list[Outcome]:
+    seeds_shape = settings.seeds.rows, settings.seeds.columns
     label = f"{frame.source} {frame.index}"
     outcomes = []
     for budget in budgets:
@@ -178,7 +178,6 @@ def outcomes(
     frames: int | None = None,
     budgets: Sequence[float] = (0.05, 0.10),
     rounds: int = 8,
-    seeds_shape: tuple[int, int] = (128, 128),
     random_seeds: int = 3,
     strategies: Sequence[str] = ("all",),
     jobs: int | None = None,
@@ -199,8 +198,6 @@ def outcomes(
         Measurements beyond the seeds as shares of the frame's pixels.
     rounds : int, default 8
         Rounds of the closed loops.
-    seeds_shape : tuple of int, default (128, 128)
-        Rows and columns of the seed lattice.
     random_seeds : int, default 3
         How often strategies that draw at random are run.
     strategies : sequence of str, optional
@@ -208,24 +205,25 @@ def outcomes(
     jobs : int, optional
         Processes; default one per processor, and 1 runs in this one.
     settings : Settings, optional
-        Options of the two published selectors.
+        Of the seeds, and of the two published selectors.
     progress : callable, optional
         Called with the frames done and the frames in all, as far as they are known.
 
     Raises
     ------
     UsageError
-        If an argument is out of its range, saying which and what is allowed.
+        If there is no source, no budget or no such strategy.
     SourceNotFoundError
         If the sources hold no frame with depth.
     """
     if not sources:
         raise UsageError("no source was named; give recordings, folders or scenes.")
-    _check(every, frames, budgets, rounds, random_seeds, jobs)
+    if not budgets:
+        raise UsageError("--budget names no share; give one or more, such as 5% 10%.")
     wanted = {*strategies_of(strategies), "uniform", "oracle"}
     names = [n for n in STRATEGIES if n in wanted] + sorted(wanted.difference(STRATEGIES))
     jobs = jobs or default_threads()
-    arguments = (budgets, rounds, seeds_shape, random_seeds, names, settings or Settings())
+    arguments = (budgets, rounds, random_seeds, names, settings or Settings())
     total = _most(sources, every, frames)
     found: dict[int, list[Outcome]] = {}
 
@@ -291,26 +289,6 @@ def _spread(
             for worker in set(multiprocessing.active_children()) - others:
                 worker.kill()
         pool.shutdown(wait=done, cancel_futures=True)
-
-
-def _check(
-    every: int, frames: int | None, budgets: Sequence[float], rounds: int, random_seeds: int, jobs: int | None
-) -> None:
-    if not budgets:
-        raise UsageError("--budget names no share; give one or more, such as 0.05 0.10.")
-    for name, value in (("every", every), ("rounds", rounds), ("random-seeds", random_seeds)):
-        if value < 1:
-            raise UsageError(f"--{name} is {value}; it must be at least 1.")
-    if rounds > MOST_ROUNDS:
-        raise UsageError(f"--rounds is {rounds}; it must be at most {MOST_ROUNDS}.")
-    for name, limit in (("frames", frames), ("jobs", jobs)):
-        if limit is not None and limit < 1:
-            raise UsageError(f"--{name} is {limit}; it must be at least 1.")
-    for budget in budgets:
-        if not 0 < budget <= 1:
-            raise UsageError(
-                f"--budget is {budget}; it is a share of the frame's pixels between 0 and 1, such as 0.05."
-            )
 
 
 def summarise(found: Sequence[Outcome]) -> Results:

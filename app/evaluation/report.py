@@ -71,7 +71,6 @@ def run_evaluation(
             frames=options.frames,
             budgets=budgets,
             rounds=rounds,
-            seeds_shape=seeds_shape,
             random_seeds=options.random_seeds,
             strategies=options.strategies,
             jobs=options.jobs,

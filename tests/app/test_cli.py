@@ -493,7 +493,7 @@ def test_unexpected_error_asks_for_debug(
     def fail(*_: object) -> int:
         raise KeyError("surprise")
 
-    monkeypatch.setattr(dispatch, "parse", fail)
+    monkeypatch.setattr(dispatch, "parse_with_settings", fail)
     code, line = refuse(capsys, "replay", "x")
     assert code == 1
     assert "KeyError" in line
@@ -690,5 +690,5 @@ def test_defaults_on_the_command_line_are_the_selectors_own() -> None:
 
     for options, selector in ((GasOptions(), NeuralGasSelector), (ImprovementOptions(), ImprovementSelector)):
         for name, parameter in inspect.signature(selector).parameters.items():
-            if name != "threads":
+            if name not in ("threads", "by_sums"):  # by_sums is the option `formula`
                 assert getattr(options, name) == parameter.default, name

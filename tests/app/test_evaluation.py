@@ -23,6 +23,7 @@ from selective_depth.app.evaluation.quadtree import quadtree
 from selective_depth.app.evaluation.report import comparison, print_results, to_markdown
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of
 from selective_depth.app.pictures import palette
+from selective_depth.app.settings import SeedOptions, Settings
 from selective_depth.drivers.errors import OutputError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.source import DepthSource
@@ -221,7 +222,7 @@ def test_frames_and_seeds_do_not_depend_on_how_many_processes(folder: Path) -> N
         "every": 2,
         "budgets": (0.05,),
         "rounds": 2,
-        "seeds_shape": SHAPE,
+        "settings": Settings(seeds=SeedOptions(*SHAPE)),
         "random_seeds": 2,
         "strategies": ("random", "loop"),
     }
@@ -259,7 +260,7 @@ def test_no_more_frames_are_read_ahead_than_keep_the_processes_busy(
         [str(folder)] * 5,
         every=1,
         budgets=(0.05,),
-        seeds_shape=SHAPE,
+        settings=Settings(seeds=SeedOptions(*SHAPE)),
         strategies=(),
         jobs=2,
         progress=progress,
@@ -278,17 +279,20 @@ def test_selecting_pays_on_a_made_scene() -> None:
 @pytest.mark.parametrize(
     ("option", "words"),
     [
-        ({"every": 0}, "--every is 0; it must be at least 1"),
-        ({"rounds": 0}, "--rounds is 0"),
-        ({"frames": 0}, "--frames is 0"),
-        ({"jobs": 0}, "--jobs is 0; it must be at least 1"),
-        ({"budgets": (1.5,)}, r"--budget is 1.5; it is a share .* such as 0\.05"),
-        ({"strategies": ("gradiant",)}, "has 'gradiant'; it takes main, all, FILE.py:NAME, or"),
+        (["--every", "0"], "--every is 0; it must be 1 or more"),
+        (["--rounds", "0"], "--rounds is 0; it must be from 1 to 254"),
+        (["--frames", "0"], "--frames is 0"),
+        (["--jobs", "0"], "--jobs is 0; it must be 1 or more"),
+        (["--budget", "1.5"], "--budget is 1.5; it must be a share between 0 and 1"),
+        (["--budget", "5"], "--budget is 5; it must be a share"),
+        (["--strategies", "gradiant"], "has 'gradiant'; it takes main, all, FILE.py:NAME, or"),
     ],
 )
-def test_misuse_is_refused_in_a_sentence(option: dict[str, object], words: str) -> None:
-    with pytest.raises(UsageError, match=words):
-        outcomes(["nowhere"], **option)  # type: ignore[arg-type]
+def test_misuse_is_refused_in_a_sentence(
+    option: list[str], words: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["evaluate", str(folder), *option]) == MISUSED
+    assert words in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_source_that_shows_nothing_is_refused(tmp_path: Path) -> None:

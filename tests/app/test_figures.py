@@ -98,8 +98,8 @@ def small(monkeypatch):
 
 
 def test_one_command_makes_each_figure(small, tmp_path: Path):
-    for command, name in (("epochs", "one.png"), ("densities", "two.webp")):
-        assert cli.run([command, OBJECT, "--out", str(tmp_path / name)]) == 0
+    for command, name in (("1", "one.png"), ("2", "two.webp")):
+        assert cli.run(["figure", command, OBJECT, "--out", str(tmp_path / name)]) == 0
         picture = cv2.imread(str(tmp_path / name))
         assert picture is not None and picture.std() > 10
 
@@ -123,7 +123,7 @@ def test_the_table_of_the_paper_shows_our_times_beside_the_papers(capsys):
 
 def test_epochs_go_on_a_timeline_of_their_own(small, tmp_path: Path):
     rrd = tmp_path / "out.rrd"
-    words = ["epochs", OBJECT, "--out", str(tmp_path / "out.png"), "--save", str(rrd)]
+    words = ["figure", "1", OBJECT, "--out", str(tmp_path / "out.png"), "--save", str(rrd)]
     assert cli.run(words) == 0
     epochs: dict[str, set[int]] = {}
     for part in RrdReader(str(rrd)).stream():
@@ -145,13 +145,13 @@ def test_table_is_written(small, tmp_path: Path, capsys):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["epochs", OBJECT, "--out", "x.gif"], "must end in .png, .webp, .pdf or .svg"),
-        (["epochs", OBJECT, "--out", "no/such/x.png"], "its folder does not exist"),
-        (["epochs", OBJECT, "--frame", "9"], "the last is"),
+        (["figure", "1", OBJECT, "--out", "x.gif"], "must end in .png, .webp, .pdf or .svg"),
+        (["figure", "1", OBJECT, "--out", "no/such/x.png"], "its folder does not exist"),
+        (["figure", "1", OBJECT, "--frame", "9"], "the last is"),
         (["nodes", OBJECT, "--every", "0"], "--every is 0; it must be 1 or more"),
         (["nodes", OBJECT, "--out", "no/such/x.md"], "its folder does not exist"),
         (["nodes", "virtual:ball?live=1", "--every", "2"], "never ends"),
-        (["epochs", "nowhere.ply"], "nowhere.ply"),
+        (["figure", "1", "nowhere.ply"], "nowhere.ply"),
     ],
 )
 def test_bad_input_is_one_sentence_and_no_zero(words, sentence, capsys):
@@ -173,7 +173,7 @@ from selective_depth.app.pictures import palette, write_picture
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 figures.EPOCHS, figures.FIRST_POINTS, figures.FIRST_NODES = (1, 2), 500, 100
-words = ["epochs", {OBJECT!r}, "--out", {str(tmp_path / "out.webp")!r}, "--save", {str(rrd)!r}]
+words = ["figure", "1", {OBJECT!r}, "--out", {str(tmp_path / "out.webp")!r}, "--save", {str(rrd)!r}]
 raise SystemExit(cli.run(words))
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
