@@ -6,14 +6,14 @@ from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
-from selective_depth.drivers.errors import DamagedRecordingError, OutputError
+from selective_depth.drivers.errors import DamagedRecordingError
 from selective_depth.drivers.folder import FolderWriter
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.oni.codec import encode_depth, mend_order
+from selective_depth.drivers.oni.codec import encode_depth
 from selective_depth.drivers.oni.files import open_regular, read_payload
 from selective_depth.drivers.oni.inspection import inspect_oni
 from selective_depth.drivers.oni.reader import read_depth
-from selective_depth.drivers.oni.records import CODEC_TABLE, CODECS, NodeAddition
+from selective_depth.drivers.oni.records import CODEC_NONE, CODEC_TABLE, CODECS, NodeAddition
 from selective_depth.drivers.oni.report import OniFrame, OniReport
 from selective_depth.drivers.oni.writer import RecordWriter, depth_properties
 
@@ -57,61 +57,25 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
             for node in report.nodes:
                 if node.is_stream and not (node.ready and node.codec in CODECS):
                     continue
-                known = defaults if node is report.depth else {}
-                properties = {**known, **node.properties}
-                if node is report.depth and not report.as_stored:
-                    properties = known  # it is written as it is delivered
-                addition = NodeAddition(node.name, node.node_type, node.codec, None, 0)
+                properties, codec = node.properties, node.codec
+                if node is report.depth:  # it is written as it is delivered
+                    properties = {**defaults, **(properties if report.as_stored else {})}
+                    codec = CODEC_NONE if codec == CODEC_NONE else CODEC_TABLE
+                addition = NodeAddition(node.name, node.node_type, codec, None, 0)
                 writer.add_node(node.number, addition, properties)
                 frames += [(node.number, frame) for frame in node.frames]
             writer.begin()
             for number, frame in sorted(frames, key=lambda item: item[1].record_offset):
                 payload = read_payload(file, frame)
-                if number == report.depth.number and not report.as_stored:
+                if number == report.depth.number:
                     depth_mm = read_depth(report, file, frame)
                     assert depth_mm is not None  # decoded a moment ago
-                    payload = encode_depth(depth_mm)
-                elif number == report.depth.number:
-                    payload = _mended_payload(report, payload) or payload
+                    plain = report.depth.codec == CODEC_NONE
+                    payload = depth_mm.astype("<u2").tobytes() if plain else encode_depth(depth_mm)
                 writer.add_frame(number, frame.timestamp_us, payload)
         finally:
             writer.close()
     return inspect_oni(out_path, decode=True, timeout_s=float("inf"))
-
-
-def mend_oni(path: str | Path) -> int:
-    """Put right, in place, the frames whose last pixels OpenNI2's recorder swapped.
-
-    To be called after recording: the file is whole, but OpenNI2's own player and viewers would
-    show up to 28 wrong pixels in the corner of such a frame (see `oni_codec`). Two bytes of each
-    such frame change places, nothing else is touched.
-
-    Returns
-    -------
-    int
-        Number of frames put right.
-
-    Raises
-    ------
-    SourceNotFoundError
-        If there is no such file.
-    OutputError
-        If it cannot be written.
-    """
-    report = inspect_oni(path)
-    frames = report.depth.frames if report.depth is not None else []
-    mended = 0
-    try:
-        with Path(path).open("r+b", buffering=0) as file:
-            for frame in frames:
-                payload = _mended_payload(report, read_payload(file, frame))
-                if payload is not None:
-                    file.seek(frame.payload_offset + frame.payload_size - 2)
-                    file.write(payload[-2:])
-                    mended += 1
-    except OSError as error:
-        raise OutputError(f"'{path}' cannot be written ({error.strerror}); check its permissions.") from error
-    return mended
 
 
 def export_oni(
@@ -160,12 +124,6 @@ def export_oni(
             if progress is not None:
                 progress(index + 1)
     return report
-
-
-def _mended_payload(report: OniReport, payload: bytes) -> bytes | None:
-    if report.depth is None or report.camera is None or report.depth.codec != CODEC_TABLE:
-        return None
-    return mend_order(payload, report.camera.height, report.camera.width)
 
 
 def _rescuable(path: str | Path) -> OniReport:

@@ -10,11 +10,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Final, Self
 
+import numpy as np
+
 from selective_depth.drivers.errors import OutputError
-from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.drivers.oni.codec import encode_depth
+from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
+from selective_depth.drivers.oni.codec import MAX_DISTINCT, decode_depth, encode_depth
 from selective_depth.drivers.oni.records import (
     BEGIN_FIELDS,
+    CODEC_NONE,
     CODEC_TABLE,
     FILE_HEADER,
     FRAME_FIELDS,
@@ -62,6 +65,8 @@ class RecordWriter:
     ----------
     path : Path
         The file; must not exist.
+    keep : bool, default False
+        Leave what could be written, and `close` it properly, where it cannot be written further.
 
     Raises
     ------
@@ -69,15 +74,16 @@ class RecordWriter:
         If it exists, or cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, keep: bool = False) -> None:
         self.path = path
+        self._keep = keep
         try:
-            self._file: BinaryIO = path.open("xb")
+            self._file: BinaryIO = path.open("xb", buffering=0)  # whole in the file at every record
         except FileExistsError:
             raise OutputError(f"'{path}' exists already; give another name, or remove it.") from None
         except OSError as error:
             raise self._failed(error) from error
-        self._offset = 0
+        self._offset = self.payload_offset = self.payload_size = 0
         self._nodes: dict[int, NodeAddition] = {}
         self._node_offsets: dict[int, int] = {}
         self._entries: dict[int, list[tuple[int, int, int]]] = {}
@@ -109,7 +115,12 @@ class RecordWriter:
         fields = FRAME_FIELDS.pack(timestamp_us, len(entries) + 1)
         offset = self._append(pack_record(Kind.NEW_DATA, node, fields, payload, previous))
         entries.append((timestamp_us, 0, offset))
+        self.payload_offset, self.payload_size = self._offset - len(payload), len(payload)
         self._latest_us = max(self._latest_us, timestamp_us)
+
+    def frame_count(self, node: int) -> int:
+        """How many frames of a node there are."""
+        return len(self._entries[node])
 
     def close(self) -> None:
         """Finish the file. Harmless when called twice."""
@@ -118,7 +129,6 @@ class RecordWriter:
         try:
             with self._saying():
                 self._finish()
-                self._file.flush()
         finally:
             self._file.close()
 
@@ -154,9 +164,10 @@ class RecordWriter:
         return FILE_HEADER.pack(IDENTITY, *VERSION, latest_us, highest)
 
     def _append(self, data: bytes) -> int:
-        offset = self._offset
+        offset, left = self._offset, memoryview(data)
         with self._saying():
-            self._file.write(data)
+            while left:
+                left = left[self._file.write(left) :]
         self._offset += len(data)
         return offset
 
@@ -165,7 +176,11 @@ class RecordWriter:
         try:
             yield
         except OSError as error:
-            self.discard()
+            if self._keep:
+                with suppress(OSError):  # half a record
+                    self._file.truncate(self._file.seek(self._offset))
+            else:
+                self.discard()
             raise self._failed(error) from error
 
     def _failed(self, error: OSError) -> OutputError:
@@ -184,6 +199,8 @@ class OniWriter:
         The file; must not exist.
     fps : float, default 30
         Nominal frame rate; the format stores it as a whole number.
+    keep : bool, default False
+        As for `RecordWriter`.
 
     Raises
     ------
@@ -193,14 +210,17 @@ class OniWriter:
     Notes
     -----
     The format stores fields of view, not principal points: a camera that does not look through
-    the middle of its image comes back as one that does.
+    the middle of its image comes back as one that does. Depth is compressed, until a frame holds
+    more different depths than that can say: then the file is written anew without.
     """
 
-    def __init__(self, path: str | Path, *, fps: float = _DEFAULT_FPS) -> None:
+    def __init__(self, path: str | Path, *, fps: float = _DEFAULT_FPS, keep: bool = False) -> None:
         self._fps = fps
+        self._keep = keep
         self._camera: Camera | None = None
         self._first_us = 0
-        self._writer = RecordWriter(Path(path))
+        self._codec = CODEC_TABLE
+        self._writer = RecordWriter(Path(path), keep=keep)
 
     def write(self, frame: DepthFrame) -> None:
         """Add a frame. Timestamps are stored as the time since the first.
@@ -228,7 +248,21 @@ class OniWriter:
                 " frames.toml (2^32 more from there on, for a clock of 32 bits), or export to a"
                 " folder"
             )
-        self._writer.add_frame(1, since_us, encode_depth(frame.depth_mm))
+        if self._codec == CODEC_TABLE and np.unique(frame.depth_mm).size > MAX_DISTINCT:
+            self._start_plain()
+        if self._codec == CODEC_TABLE:
+            payload = encode_depth(frame.depth_mm)
+        else:
+            payload = frame.depth_mm.astype("<u2").tobytes()
+        self._writer.add_frame(1, since_us, payload)
+
+    def read_back(self) -> DepthArray | None:
+        """The last frame as it stands in the file; None if it cannot be decoded."""
+        assert self._camera is not None
+        with self._writer.path.open("rb") as file:
+            file.seek(self._writer.payload_offset)
+            payload = file.read(self._writer.payload_size)
+        return decode_depth(self._codec, payload, self._camera.height, self._camera.width)
 
     def close(self) -> None:
         """Finish the file; without a frame there is none."""
@@ -255,9 +289,33 @@ class OniWriter:
             )
         self._camera = camera
         self._first_us = frame.timestamp_us
-        depth = NodeAddition("Depth", NodeType.DEPTH, CODEC_TABLE, None, 0)
+        self._add_depth(camera)
+
+    def _add_depth(self, camera: Camera) -> None:
+        depth = NodeAddition("Depth", NodeType.DEPTH, self._codec, None, 0)
         self._writer.add_node(1, depth, depth_properties(camera, self._fps))
         self._writer.begin()
+
+    def _start_plain(self) -> None:
+        """Write what is there again, uncompressed."""
+        from selective_depth.drivers.oni.reader import OniReader
+
+        assert self._camera is not None
+        path = self._writer.path
+        self._codec = CODEC_NONE
+        written, compressed = self._writer.frame_count(1), path.with_name(f"{path.name}.part")
+        self._writer.close()
+        path.replace(compressed)
+        try:
+            self._writer = RecordWriter(path, keep=self._keep)
+            self._add_depth(self._camera)
+            if written:
+                with OniReader(compressed) as frames:
+                    for frame in frames:
+                        plain = frame.depth_mm.astype("<u2").tobytes()
+                        self._writer.add_frame(1, frame.timestamp_us, plain)
+        finally:
+            compressed.unlink(missing_ok=True)
 
 
 def write_oni(path: str | Path, frames: Iterable[DepthFrame], *, fps: float | None = None) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
 from selective_depth.drivers.errors import (
@@ -14,7 +15,7 @@ from selective_depth.drivers.errors import (
     SourceNotFoundError,
     SourceTimeoutError,
 )
-from selective_depth.drivers.frame import DepthArray, DepthFrame
+from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.openni.process import Message, Worker, camera_of, error_of
 from selective_depth.drivers.openni.sensors import DeviceInfo
 from selective_depth.drivers.source import DepthSource
@@ -44,6 +45,8 @@ class DeviceSettings:
         Deliver the image as in a mirror.
     registration : bool, default False
         Depth registered to the sensor's colour camera, where it can.
+    first_frame_s : float, default 10
+        How long a sensor may take for its first frame; later on it is opened afresh after 3 s.
     """
 
     width: int = 640
@@ -51,6 +54,7 @@ class DeviceSettings:
     fps: int = 30
     mirror: bool = False
     registration: bool = False
+    first_frame_s: float = 10.0
 
 
 class _Count:
@@ -108,6 +112,9 @@ class OpenNIDevice(DepthSource):
         Which sensor; empty for the only one.
     settings : DeviceSettings, optional
         Default 640x480 at 30 fps, not mirrored, not registered.
+    tap : callable, optional
+        Gets every frame that the sensor made, on the thread that takes them in, whether it is read
+        or not: `OniRecorder.write`. It must be quick.
 
     Attributes
     ----------
@@ -136,7 +143,13 @@ class OpenNIDevice(DepthSource):
     frame_count = None
     device: DeviceInfo
 
-    def __init__(self, device_uri: str = "", settings: DeviceSettings | None = None) -> None:
+    def __init__(
+        self,
+        device_uri: str = "",
+        settings: DeviceSettings | None = None,
+        *,
+        tap: Callable[[DepthFrame], None] | None = None,
+    ) -> None:
         self.uri = f"openni:{device_uri}" if device_uri else "openni"
         self.settings = settings or DeviceSettings()
         self.dropped = 0
@@ -144,10 +157,12 @@ class OpenNIDevice(DepthSource):
         self.misfits = 0
         self.state_reason = ""
         self._wanted_uri = device_uri
+        self._tap = tap
         self._changed = threading.Condition()
         self._closing = threading.Event()
-        self._newest: tuple[DepthArray, int, int] | None = None
+        self._newest: DepthFrame | None = None
         self._failure: BaseException | None = None
+        self._first: int | None = None
         self._first_number = 0
         self._next_number: int | None = None
         self._count = _Count()
@@ -189,18 +204,18 @@ class OpenNIDevice(DepthSource):
                 raise self._failure
             if self._newest is None:
                 raise self._absence(timeout_s)
-            (depth_mm, number, timestamp_us), self._newest = self._newest, None
+            frame, self._newest = self._newest, None
+        number = frame.index
         if self._next_number is None:
             self._first_number = self._next_number = number
         self.dropped += number - self._next_number
         self._next_number = number + 1
-        return DepthFrame(
-            depth_mm=depth_mm,
-            index=number - self._first_number,
-            timestamp_us=timestamp_us,
-            camera=self.camera,
-            source=self.uri,
-        )
+        return replace(frame, index=number - self._first_number)
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until a frame comes, but no longer than this, and take none."""
+        with self._changed:
+            self._changed.wait(timeout_s)
 
     def close(self) -> None:
         """Stop the sensor and release it. Harmless when called twice."""
@@ -276,6 +291,7 @@ class OpenNIDevice(DepthSource):
     def _follow(self) -> tuple[str, str]:
         """Take frames in until something is wrong; return the new state and the reason."""
         misfits = unheard = 0
+        silence_s = max(self.settings.first_frame_s, _RESTART_S)
         while not self._closing.is_set():
             message = self._worker.receive(_BEAT_S)
             # Beats, not the clock: if this process was held up, it is not the worker's fault.
@@ -285,7 +301,7 @@ class OpenNIDevice(DepthSource):
                     self._worker.close()  # at once: it would not stop the sensor any more
                     return "reconnecting", "OpenNI2 hangs"
             elif message["kind"] == "frame":
-                misfits = 0
+                misfits, silence_s = 0, _RESTART_S
                 self._arrive(message)
             elif message["kind"] == "misfit":
                 misfits += 1
@@ -294,8 +310,8 @@ class OpenNIDevice(DepthSource):
                     why = f"{misfits} wrong frames in a row; the last: {message['problem']}"
                     return "reconnecting", why
             elif message["kind"] == "idle":
-                if message["silent_s"] > _RESTART_S:
-                    return "reconnecting", f"no frame for {_RESTART_S:g} s"
+                if message["silent_s"] > silence_s:
+                    return "reconnecting", f"no frame for {silence_s:g} s"
                 if message["silent_s"] > _STALL_S:
                     self._become("stalled", "it sends no frames")
             elif message["kind"] == "lost":
@@ -309,12 +325,18 @@ class OpenNIDevice(DepthSource):
     def _arrive(self, message: Message) -> None:
         depth_mm = self._worker.take(message, self.camera.width, self.camera.height)
         if self.settings.mirror:
-            depth_mm = depth_mm[:, ::-1]
+            depth_mm = depth_mm[:, ::-1].copy()
+        depth_mm.flags.writeable = False  # handed over: the frame need not copy it
         number, timestamp_us = self._count.follow(message)
+        if self._first is None:
+            self._first = number
+        frame = DepthFrame(depth_mm, number - self._first, timestamp_us, self.camera, self.uri)
+        if self._tap is not None:
+            self._tap(frame)
         self._attempts = 0
         with self._changed:
             self.state, self.state_reason = "live", ""
-            self._newest = depth_mm, number, timestamp_us
+            self._newest = frame
             self._changed.notify_all()
 
     def _reopen(self) -> None:

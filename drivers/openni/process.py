@@ -27,7 +27,7 @@ from selective_depth.drivers.openni.usb import usb_advice
 Message = dict[str, Any]
 """What the worker says; its ``kind`` tells what else is in it."""
 
-_SLOTS = 4
+_SLOTS = 12  # 0.4 s of frames, for one that records on a busy machine
 _SLOT_BYTES = 1280 * 1024 * 2  # more than any sensor of this kind has; unused pages cost none
 _ERRORS = {kind.__name__: kind for kind in SourceError.__subclasses__()}
 
@@ -58,9 +58,7 @@ class Worker:
     Parameters
     ----------
     job : str
-        ``"list"``, ``"device"``, ``"recording"`` or ``"record"``.
-    keep_open : tuple of int, optional
-        File descriptors that the worker needs.
+        ``"list"`` or ``"device"``.
     **values
         The job's own parameters, as `openni_worker` reads them.
 
@@ -70,7 +68,7 @@ class Worker:
         If OpenNI2 is not installed.
     """
 
-    def __init__(self, job: str, *, keep_open: tuple[int, ...] = (), **values: object) -> None:
+    def __init__(self, job: str, **values: object) -> None:
         runtime = find_runtime()
         self._memory, name, descriptors = _anonymous_memory(_SLOTS * _SLOT_BYTES)
         noisy = bool(os.environ.get("SELECTIVE_DEPTH_DEBUG"))
@@ -81,7 +79,7 @@ class Worker:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=None if noisy else subprocess.DEVNULL,
-                pass_fds=(*descriptors, *keep_open),
+                pass_fds=descriptors,
                 **_own_group(),
             )
         finally:
@@ -121,10 +119,6 @@ class Worker:
         image = pixels.reshape(height, width).copy()
         self._tell(f"free {frame['slot']}")
         return image
-
-    def stop(self) -> None:
-        """Ask the worker to finish its job; its last messages still come."""
-        self._tell("stop")
 
     def close(self, grace_s: float = 0.0) -> None:
         """End the process: let it finish for so long, then kill it. Harmless when called twice."""

@@ -28,10 +28,7 @@ else:  # a script finds what lies beside it only if told; last, to stand in noth
 
 WAIT_S = 0.2  # longest uninterrupted wait for a frame, and the beat of "idle" messages
 SETTLE_S = 0.05  # between stop and close: the runtime's threads set their flags late
-RECORDER_START_S = 5.0  # for the recorder's own thread to write the file's beginning
-DATA_BEGIN = b"NIR\0\x08\0\0\0"  # the record after which it takes frames
 MILLIMETRES = int(openni2.PIXEL_FORMAT_DEPTH_1_MM)
-NO_GROWTH_S = 1.5  # a frame takes some 100 kB: a file that stops growing is not being written
 
 
 class Device(openni2.Device):  # type: ignore[misc]
@@ -315,107 +312,7 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
     live.close()
 
 
-def native_name(descriptor: int, path: str) -> bytes:
-    """The name under which OpenNI2 can open a file that is open here, whatever its path is like.
-
-    A byte above 127 in a path crashes the runtime and 1000 bytes abort it. Through its descriptor
-    any file opens, and each reader of a recording gets a player of its own.
-    """
-    if Path("/proc/self/fd").is_dir():
-        return b"/proc/self/fd/%d" % descriptor
-    if not path.isascii() or len(path) > 255:
-        raise JobError(
-            "SourceNotFoundError",
-            f"OpenNI2 cannot open '{path}' on this system: the path must be ASCII and at most 255"
-            " letters. Move the file.",
-        )
-    return path.encode()
-
-
-class Recording:
-    """Counts the frames of a recording and notices why it should end."""
-
-    def __init__(self, live: LiveStream, job: dict[str, Any], parent: Parent) -> None:
-        self.frames = 0
-        self._live = live
-        self._job = job
-        self._parent = parent
-        self._started = self._last_frame = self._grown_at = time.monotonic()
-        self._written = 0
-
-    def wait(self) -> None:
-        """Wait for the next frame; the recorder takes it by itself."""
-        frame = next_frame(self._live.stream)
-        if frame is not None:
-            self.frames += 1
-            self._last_frame = time.monotonic()
-            frame.close()
-
-    def ended(self) -> str:
-        """Why it is over; empty if it is not."""
-        now = time.monotonic()
-        if self._parent.stop.is_set():
-            return "stopped"
-        if self._job["frames"] is not None and self.frames >= self._job["frames"]:
-            return "done"
-        if self._job["duration_s"] is not None and now - self._started >= self._job["duration_s"]:
-            return "done"
-        if self._live.watch.lost.is_set():
-            return "the sensor was unplugged"
-        if now - self._last_frame > self._job["stall_s"]:
-            return f"the sensor sent nothing for {self._job['stall_s']:g} s"
-        return self._disk_problem(now)
-
-    def _disk_problem(self, now: float) -> str:
-        # The recorder does not report a failed write; the file itself has to be watched.
-        room = os.fstatvfs(self._job["file"])
-        written = os.fstat(self._job["file"]).st_blocks * 512
-        if written > self._written:
-            self._written, self._grown_at = written, now
-        if room.f_bavail * room.f_frsize < self._job["reserve_bytes"]:
-            return "the disk is full"
-        if self._last_frame - self._grown_at > NO_GROWTH_S:
-            return "the file does not grow any more"
-        return ""
-
-
-def wait_until_recording(file: int) -> None:
-    """Wait until the recorder takes frames: what comes before it silently drops."""
-    deadline = time.monotonic() + RECORDER_START_S
-    while DATA_BEGIN not in os.pread(file, 1 << 16, 0):
-        if time.monotonic() > deadline:
-            raise JobError(
-                "OutputError",
-                "The recording cannot be written: OpenNI2 does not begin the file. Is there room"
-                " on the disk?",
-            )
-        time.sleep(0.005)
-    time.sleep(SETTLE_S)
-
-
-def run_record(job: dict[str, Any], parent: Parent) -> None:
-    """Record a live sensor until enough, told to stop, or something is wrong."""
-    initialize(job)
-    live = LiveStream(job, parent)
-    recorder = openni2.Recorder(native_name(job["file"], job["path"]))
-    recorder.attach(live.stream, False)
-    recorder.start()
-    wait_until_recording(job["file"])
-    live.start()
-    parent.send("opened", **describe(live.stream))
-    recording = Recording(live, job, parent)
-    while not (ended := recording.ended()):
-        recording.wait()
-        parent.send("recorded", frames=recording.frames)
-    live.stream.stop()
-    recorder.stop()
-    recorder.close()
-    os.fsync(job["file"])
-    parent.send("saved", ended=ended)
-    live.close()
-
-
-JOBS = {"list": run_list, "device": run_device, "record": run_record}
+JOBS = {"list": run_list, "device": run_device}
 
 
 def main() -> None:

@@ -33,6 +33,7 @@ import hashlib
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -131,21 +132,23 @@ def record_oni(frames: npt.NDArray[np.uint16], out: Path, *, fps: int = 60, over
     overwrite : bool, default True
         Whether an older file of that name is replaced.
     """
-    from selective_depth.drivers.openni import DeviceSettings, record
+    from selective_depth.drivers.oni import inspect_oni
+    from selective_depth.drivers.openni.runtime import find_runtime
 
     if frames.max(initial=0) >= 10_000:
         raise ValueError(f"depth reaches {frames.max()} mm; the codec keeps values below 10000")
+    if out.exists():
+        if not overwrite:
+            raise FileExistsError(out)
+        out.unlink()
     count, height, width = frames.shape
-    before = dict(os.environ)
+    script = Path(__file__).parent.parent / "openni2_recorder.py"
     with tempfile.TemporaryDirectory() as folder:
         sensor = VirtualSensor(Path(folder), frames, fps=fps, limit=count)
-        os.environ.update(sensor.env)
-        try:
-            report = record(out, frames=count, settings=DeviceSettings(width, height), overwrite=overwrite)
-        finally:
-            for key in sensor.env:
-                os.environ.pop(key)
-                if key in before:
-                    os.environ[key] = before[key]
-    if report.frames != count or report.problem:
-        raise RuntimeError(f"{out} has {report.frames} of {count} frames. {report.problem}")
+        library = str(sensor.runtime / find_runtime().path.name)
+        words = [sys.executable, str(script), library, str(out), *map(str, (count, width, height))]
+        subprocess.run(words, env=os.environ | sensor.env, check=True, timeout=60 + count / fps)
+    report = inspect_oni(out, decode=True)
+    os.truncate(out, report.size_bytes - report.tail_bytes)
+    if report.readable_frames != count:
+        raise RuntimeError(f"{out} has {report.readable_frames} of {count} frames.")

@@ -177,7 +177,7 @@ def test_openni2_s_player_delivers_the_same_frames(oni_sample: OniSample, tmp_pa
     """Of the recordings that come with the program, and of each codec and kind of stream.
 
     Where its own recorder swapped the last pixels of a frame, the player shows that and we do not:
-    see `test_what_openni2s_recorder_swaps_is_read_rightly_and_can_be_mended_in_place`.
+    see `test_what_openni2s_recorder_swaps_is_read_rightly_and_repaired`.
     """
     draw = np.random.default_rng(3)
     depth_mm = draw.integers(0, 9999, (5, 120, 160)).astype(np.uint16)

@@ -103,7 +103,7 @@ def test_the_newest_frame_wins_and_drops_are_counted(virtual_sensor: VirtualSens
     virtual_sensor.set(limit=20)
     with OpenNIDevice() as device:
         first = device.read()
-        wait_for(lambda: device._newest is not None and device._newest[1] == 19)
+        wait_for(lambda: device._newest is not None and device._newest.index == 19)
         last = device.read()
         assert sensor_frame(last) == 19
         assert last.index == 19 - sensor_frame(first)

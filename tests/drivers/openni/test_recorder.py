@@ -1,4 +1,4 @@
-"""Recording a live sensor through the real OpenNI2 recorder."""
+"""Recording a live sensor of the real OpenNI2 runtime."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from raw_oni_player import digest_of, play_all
 from virtual_sensor import VirtualSensor
 
+from selective_depth.app import cli
 from selective_depth.drivers.errors import (
     DeviceRefusedError,
     OutputError,
@@ -22,7 +24,9 @@ from selective_depth.drivers.errors import (
     SourceNotFoundError,
 )
 from selective_depth.drivers.oni import OniReader, inspect_oni
+from selective_depth.drivers.open import open_source
 from selective_depth.drivers.openni import record
+from selective_depth.drivers.openni.runtime import find_runtime
 
 pytestmark = pytest.mark.openni
 
@@ -59,7 +63,7 @@ def test_every_frame_from_the_first_on(virtual_sensor: VirtualSensor, tmp_path: 
 def test_frames_whose_last_pixel_differs_replay_bit_for_bit(
     virtual_sensor: VirtualSensor, tmp_path: Path
 ) -> None:
-    """The runtime's own encoder swaps two bytes of such frames; the recording is mended."""
+    """The runtime's own encoder swaps two bytes of such frames; ours does not."""
     drawn = np.random.default_rng(5).integers(500, 9000, 4)
     frames = np.full((4, 480, 640), 1200, np.uint16)
     frames[:, -1, -40:-1] = drawn[:, None]
@@ -74,16 +78,41 @@ def test_frames_whose_last_pixel_differs_replay_bit_for_bit(
             np.testing.assert_array_equal(frame.depth_mm, frames[index % 4])
 
 
-def test_frames_that_cannot_be_decoded_are_told(virtual_sensor: VirtualSensor, tmp_path: Path) -> None:
+def test_frames_of_a_wrong_size_are_not_recorded(virtual_sensor: VirtualSensor, tmp_path: Path) -> None:
     def disturb(frames: int) -> None:
         if frames == 6:
-            virtual_sensor.set(odd=1)  # frames of half the height, which are recorded as well
+            virtual_sensor.set(odd=1)  # frames of half the height
 
     report = record(tmp_path / "out.oni", frames=20, progress=disturb)
-    assert report.ended == "done"
-    assert 6 <= report.frames < 20
-    assert "is not whole (frame" in report.problem
-    assert "--repair" in report.problem
+    assert "15 wrong frames in a row" in report.ended
+    assert 6 <= report.frames < 20 and report.problem == ""
+    assert len(images(report.path)) == report.frames
+
+
+def test_far_depth_is_recorded_as_it_was_delivered(
+    virtual_sensor: VirtualSensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenNI2's recorder turns values beyond its stream's largest, 10 m, into small depths."""
+    draw = np.random.default_rng(3)
+    frames = np.full((4, 480, 640), 10_000, np.uint16)
+    frames[1] = draw.choice([0, 800, 9_999, 10_000, 10_001, 40_000, 65_534], (480, 640))
+    frames[2] = draw.integers(0, 65_535, (480, 640))  # more depths than compression can tell
+    frames.tofile(tmp_path / "far.raw")
+    virtual_sensor.set(frames=tmp_path / "far.raw", limit=8)
+    report = record(tmp_path / "out.oni", frames=8)
+    assert (report.frames, report.problem, report.ended) == (8, "", "done")
+    assert inspect_oni(report.path, decode=True).complete
+    with OniReader(report.path) as recording:
+        for index, frame in enumerate(recording):
+            np.testing.assert_array_equal(frame.depth_mm, frames[index % 4])
+    assert cli.run(["export", str(report.path), str(tmp_path / "frames")]) == 0
+    with open_source(tmp_path / "frames") as folder:
+        for index, frame in enumerate(folder):
+            np.testing.assert_array_equal(frame.depth_mm, frames[index % 4])
+    monkeypatch.delenv("OPENNI2_REDIST")  # the system's, without the sensor
+    played = next(play_all([report.path], find_runtime().path, patience_s=3.0))
+    right = digest_of((n + 1, 480, 640, frames[n % 4].tobytes()) for n in range(8))
+    assert (played.frames, played.digest) == right
 
 
 def test_so_long_as_asked(virtual_sensor: VirtualSensor, tmp_path: Path) -> None:
@@ -95,29 +124,19 @@ def test_so_long_as_asked(virtual_sensor: VirtualSensor, tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("fault", "ended"),
-    [({"connected": 0}, "unplugged"), ({"stall": 1}, "sent nothing"), ({"crash": 1}, "SIGSEGV")],
+    [({"connected": 0}, "unplugged"), ({"stall": 1}, "no frame for 3 s"), ({"crash": 1}, "SIGSEGV")],
 )
 def test_a_fault_of_the_sensor_ends_it_with_what_is_there(
-    virtual_sensor: VirtualSensor,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    fault: dict[str, int],
-    ended: str,
+    virtual_sensor: VirtualSensor, tmp_path: Path, fault: dict[str, int], ended: str
 ) -> None:
-    monkeypatch.setattr("selective_depth.drivers.openni.recorder._STALL_S", 0.6)
-
     def disturb(frames: int) -> None:
         if frames == 6:
             virtual_sensor.set(**fault)
 
     report = record(tmp_path / "out.oni", progress=disturb)
     assert ended in report.ended
-    assert report.frames >= 5
-    if "crash" in fault:
-        assert "--repair" in report.problem
-    else:
-        assert report.problem == ""
-        assert len(images(report.path)) == report.frames
+    assert report.frames >= 5 and report.problem == ""
+    assert len(images(report.path)) == report.frames
 
 
 def test_a_file_that_cannot_grow_is_noticed(virtual_sensor: VirtualSensor, tmp_path: Path) -> None:
@@ -125,7 +144,7 @@ def test_a_file_that_cannot_grow_is_noticed(virtual_sensor: VirtualSensor, tmp_p
     script = (
         "import resource, sys\n"
         "from selective_depth.drivers.openni import record\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (12_000_000, 12_000_000))\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (36_000_000, 36_000_000))\n"
         "report = record(sys.argv[1])\n"
         "print(report.ended, report.frames, report.problem, sep='|')\n"
     )
@@ -137,9 +156,9 @@ def test_a_file_that_cannot_grow_is_noticed(virtual_sensor: VirtualSensor, tmp_p
         [sys.executable, "-c", script, str(out)], capture_output=True, text=True, timeout=30
     ).stdout
     ended, frames, problem = answer.strip().split("|")
-    assert ended == "the file does not grow any more"
-    assert int(frames) > 0
-    assert "--repair" in problem
+    assert "cannot be written (File too large)" in ended
+    assert int(frames) > 0 and "not whole" not in problem
+    assert inspect_oni(out, decode=True).readable_frames == int(frames)
 
 
 @pytest.mark.parametrize(
@@ -163,15 +182,17 @@ def test_a_full_disk_is_refused_at_once_and_noticed_on_the_way(
     virtual_sensor: VirtualSensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     free_bytes = shutil.disk_usage(tmp_path).free
-    monkeypatch.setattr("selective_depth.drivers.openni.recorder._RESERVE_BYTES", 2 * free_bytes)
+    monkeypatch.setattr("selective_depth.drivers.oni.recorder.RESERVE_BYTES", 2 * free_bytes)
     with pytest.raises(OutputError, match="MB are free"):
         record(tmp_path / "out.oni")
     assert not list(tmp_path.glob("out*"))
     plenty = shutil.disk_usage(tmp_path)._replace(free=9 * free_bytes)
-    monkeypatch.setattr("shutil.disk_usage", lambda _: plenty)
-    report = record(tmp_path / "out.oni")
-    assert (report.ended, report.frames) == ("the disk is full", 0)
-    assert "holds no frame" in report.problem
+    looks = iter([plenty] * 6)
+    scarce = plenty._replace(free=1000)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: next(looks, scarce))
+    report = record(tmp_path / "out.oni", duration_s=20)
+    assert (report.ended, report.frames, report.problem) == ("the disk is full", 5, "")
+    assert len(images(report.path)) == 5
 
 
 @pytest.mark.parametrize(
