@@ -167,14 +167,15 @@ def check(
     (f"{PROGRAM} export virtual:ball ball.oni --frames 90", "of any source"),
 )
 def export(source: Source, out: Annotated[Path, arg(metavar="OUT")], /, frames: Limit = None) -> int:
-    """Save the frames of a source as PNG files, or as an .oni file; needs no OpenNI2.
+    """Save a source's frames as PNG files, an .oni file or a ROS 2 bag; needs no OpenNI2.
 
     Parameters
     ----------
     source : str
         Anything that 'replay' takes.
     out : Path
-        A new folder for PNG files and their sidecar, or a new file that ends in .oni.
+        A new folder for PNG files and their sidecar, a new file that ends in .oni or .mcap, or a
+        folder that ends in .ros2.
     frames : int
         Stop after this many frames.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -204,3 +205,17 @@ class DepthFrame:
         """
         depth_mm: DepthArray = self.depth_mm[uv[:, 1], uv[:, 0]]
         return depth_mm
+
+
+def millimetres(
+    raw: npt.NDArray[np.generic], values_per_metre: float, marks: Sequence[int] = ()
+) -> DepthArray:
+    """Depth in whole millimetres of values of any kind.
+
+    What is marked, not finite, below half a millimetre or beyond 65,535 mm becomes 0, no
+    measurement.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        depth_mm = np.rint(np.where(np.isin(raw, marks), 0, raw) * (1000.0 / values_per_metre))
+        within = (depth_mm > 0) & (depth_mm <= 65535)
+    return np.where(within, depth_mm, 0).astype(np.uint16)

@@ -23,6 +23,7 @@ def open_source(uri: str | Path) -> DepthSource:
         ``<file>.oni``, a recording, replayed frame by frame (``?stream=2``: its second depth);
         ``<folder>``, depth images in one of two dozen layouts; ``<file>.npy`` or ``.npz``;
         after ``?`` their ``scale`` (values per metre) and ``camera`` (fx,fy,cx,cy);
+        ``<file>.bag``, ``<file>.mcap`` or the folder of a ROS 2 bag, with a ``topic``;
         ``virtual:<scene>``, a virtual Kinect in a made scene, with options after ``?``;
         ``<file>.ply``, an object seen from a chosen side.
 
@@ -52,13 +53,19 @@ def open_source(uri: str | Path) -> DepthSource:
         from selective_depth.drivers.virtual import MeshSource
 
         return MeshSource(name)
+    if suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file():
+        from selective_depth.drivers.bag import BagReader
+
+        scale, intrinsics = options.scale(), options.camera()
+        topic = options.text("topic", "a topic's name")
+        options.done()
+        return BagReader(path, topic=topic, values_per_metre=scale, intrinsics=intrinsics)
     if path.is_dir() or (suffix in (".npy", ".npz") and path.exists()):
         from selective_depth.drivers.folder import RecordedFolder
 
-        scale = options.numbers("scale", "values per metre", 1e-2, 1e6)
-        intrinsics = options.camera()
+        scale, intrinsics = options.scale(), options.camera()
         options.done()
-        return RecordedFolder(path, values_per_metre=scale[0] if scale else None, intrinsics=intrinsics)
+        return RecordedFolder(path, values_per_metre=scale, intrinsics=intrinsics)
     if suffix == ".oni":
         from selective_depth.drivers.oni import OniReader
 
@@ -69,5 +76,5 @@ def open_source(uri: str | Path) -> DepthSource:
         raise SourceNotFoundError(f"'{named}' does not exist. {_WHAT_THERE_IS}")
     raise SourceNotFoundError(
         f"'{named}' is no depth source: a recording ends in .oni, an object in .ply, an array in"
-        " .npy or .npz, and PNG frames are given by their folder."
+        " .npy or .npz, a ROS bag in .bag or .mcap, and PNG frames are given by their folder."
     )

@@ -133,6 +133,11 @@ class Options:
         """Any text; empty if absent."""
         return self._take(name, what) or ""
 
+    def scale(self) -> float | None:
+        """The values per metre that were given for a source."""
+        given = self.numbers("scale", "values per metre", 1e-2, 1e6)
+        return given[0] if given else None
+
     def camera(self) -> tuple[float, ...] | None:
         """The intrinsics that were given for a source: fx, fy, cx, cy in pixels."""
         return self.numbers("camera", "fx,fy,cx,cy", -MOST_PX, MOST_PX)

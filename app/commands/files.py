@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
@@ -17,9 +18,14 @@ from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni import OniReport, OniWriter, export_oni, inspect_oni, repair_oni
 from selective_depth.drivers.source import DepthSource
 
+if TYPE_CHECKING:
+    from selective_depth.drivers.bag import BagWriter
+
 MOST_PROBLEMS = 20
-OTHER_FILES = (".npz", ".npy", ".png", ".rrd", ".ply", ".bag", ".mcap", ".pdf", ".svg", ".webp")
+OTHER_FILES = (".npz", ".npy", ".png", ".rrd", ".ply", ".bag", ".db3", ".pdf", ".svg", ".webp")
 """Endings of files that a folder's name must not have by mistake."""
+BAGS = (".mcap", ".ros2")
+"""Endings of an MCAP file, and of the folder of a ROS 2 bag."""
 
 
 def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
@@ -57,7 +63,7 @@ def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
 
 
 def export(source: str, out: Path, frames: int | None) -> int:
-    """Save the frames of any source as a folder of PNG files, or as an .oni file.
+    """Save the frames of any source as a folder of PNG files, an .oni file or a ROS 2 bag.
 
     Of an .oni file that is damaged, all that is readable is saved.
 
@@ -72,13 +78,13 @@ def export(source: str, out: Path, frames: int | None) -> int:
     if ending in OTHER_FILES:
         raise UsageError(
             f"'{out}' ends in {ending}, which export does not write; give the name of a folder, for"
-            " PNG files, or one that ends in .oni."
+            " PNG files, or one that ends in .oni, .mcap or .ros2."
         )
     recording, to_oni = Path(source).suffix.lower() == ".oni", ending == ".oni"
     with FrameProgress(f"Writing {out}", frames) as progress:
         if recording and to_oni and frames is None:
             count = repair_oni(source, out).readable_frames
-        elif recording and not to_oni:
+        elif recording and not to_oni and ending not in BAGS:
             readable = export_oni(source, out, progress.update, frames=frames).readable_frames
             count = readable if frames is None else min(readable, frames)
         else:
@@ -87,7 +93,7 @@ def export(source: str, out: Path, frames: int | None) -> int:
                     raise UsageError(
                         f"'{source}' never ends; say how many frames to save, as in --frames 100."
                     )
-                count = _save(opened, out, to_oni, frames, progress)
+                count = _save(opened, out, frames, progress)
                 camera = opened.camera
             middle = (camera.width / 2, camera.height / 2)
             if to_oni and (abs(camera.cx - middle[0]) > 0.01 or abs(camera.cy - middle[1]) > 0.01):
@@ -100,8 +106,15 @@ def export(source: str, out: Path, frames: int | None) -> int:
     return OK
 
 
-def _save(source: DepthSource, out: Path, to_oni: bool, frames: int | None, progress: FrameProgress) -> int:
-    writer = OniWriter(out, fps=source.fps) if to_oni else FolderWriter(out, fps=source.fps)
+def _save(source: DepthSource, out: Path, frames: int | None, progress: FrameProgress) -> int:
+    ending = out.suffix.lower()
+    writer: OniWriter | FolderWriter | BagWriter
+    if ending in BAGS:
+        from selective_depth.drivers.bag import BagWriter
+
+        writer = BagWriter(out)
+    else:
+        writer = (OniWriter if ending == ".oni" else FolderWriter)(out, fps=source.fps)
     count = 0
     with writer:
         wanted: islice[DepthFrame] = islice(source, frames)

@@ -27,7 +27,7 @@ from selective_depth.drivers.folder.cameras import CameraFile, find_camera_file
 from selective_depth.drivers.folder.images import read_raw, read_size, read_stack
 from selective_depth.drivers.folder.layouts import ARRAYS, Found, doubtful_order, find_layout
 from selective_depth.drivers.folder.sidecar import SIDECAR, Sidecar, read_sidecar
-from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
+from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame, millimetres
 from selective_depth.drivers.source import DepthSource
 
 _MILLIMETRES: Final = 1000.0
@@ -235,15 +235,7 @@ class RecordedFolder(DepthSource):
         if kind == np.uint16:
             values = np.arange(65536, dtype=np.float64)
             return _by_table(np.rint(values * (_MILLIMETRES / scale)), marks), words
-        factor = _MILLIMETRES / scale
-
-        def scaled(raw: npt.NDArray[Any]) -> DepthArray:
-            with np.errstate(invalid="ignore", over="ignore"):
-                depth_mm = np.rint(np.where(np.isin(raw, list(marks)), 0, raw) * factor)
-                within = (depth_mm > 0) & (depth_mm <= 65535)
-            return np.where(within, depth_mm, 0).astype(np.uint16)
-
-        return scaled, words
+        return lambda raw: millimetres(raw, scale, tuple(marks)), words
 
     def _look(self) -> npt.NDArray[Any]:
         """What some frames measured; those that are damaged say so when they are read."""

@@ -1,0 +1,214 @@
+"""Depth of ROS bags: raw images in mm or m, and compressedDepth, with their camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from selective_depth.drivers.bag.library import readable, rosbags
+from selective_depth.drivers.errors import SourceEndedError, SourceError, SourceNotFoundError
+from selective_depth.drivers.frame import Camera, DepthFrame, millimetres
+from selective_depth.drivers.source import DepthSource
+
+_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_CAMERA = "sensor_msgs/msg/CameraInfo"
+_RAW = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
+_PNG = b"\x89PNG"
+
+
+class BagReader(DepthSource):
+    """Depth frames of a bag, each exactly once, in the order of the bag.
+
+    Whole numbers are millimetres and floating point is metres, as ROS has it (REP 118), unless the
+    bag says its unit, as RealSense's recorder does.
+
+    Parameters
+    ----------
+    path : str or Path
+        A ``.bag``, ``.mcap`` or ``.db3`` file, or the folder of a ROS 2 bag.
+    topic : str, default ""
+        Which topic; empty for the only one that carries depth.
+    values_per_metre : float, optional
+        Scale of whole numbers.
+    intrinsics : (float, float, float, float), optional
+        fx, fy, cx, cy in pixels; default those of the CameraInfo nearest in name, and in time to
+        the first frame.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If there is no such topic, or no one depth topic.
+    DamagedRecordingError
+        If the bag cannot be read.
+    SourceError
+        If rosbags is not installed.
+    """
+
+    live = False
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        topic: str = "",
+        values_per_metre: float | None = None,
+        intrinsics: tuple[float, ...] | None = None,
+    ) -> None:
+        self.uri = str(path)
+        self.path = Path(path)
+        self.dropped = self._next = 0
+        highlevel = rosbags("highlevel")
+        types = rosbags("typesys")
+        with readable(self.path):
+            store = types.get_typestore(types.Stores.ROS2_HUMBLE)
+            self._bag: Any = highlevel.AnyReader([self.path], default_typestore=store)
+            self._bag.open()
+        try:
+            with readable(self.path):
+                self._topic = topic = self._choose(topic)
+                unit = self._depth_unit(topic)
+                self.frame_count = self._bag.topics[topic].msgcount
+                self._messages = self._of(topic)
+                time_ns, first = next(self._messages)
+                self._first: tuple[int, Any] | None = (time_ns, first)
+                raw = self._raw(first)
+                metres = raw.dtype.kind == "f"
+                self._scale = values_per_metre or (1.0 if metres else unit or 1000.0)
+                self.camera, camera_from = self._camera(raw.shape, intrinsics, time_ns)
+                duration_s = self._bag.duration / 1e9
+        except BaseException:
+            self.close()
+            raise
+        rate = (self.frame_count - 1) / duration_s if duration_s > 0 else 0.0
+        self.fps = rate if 0.01 < rate < 1000 else 30.0
+        where = "as given" if values_per_metre else "as the bag says" if unit else "as ROS has it"
+        what = "metres" if metres and self._scale == 1 else f"{self._scale:g} values a metre"
+        camera = self.camera
+        self.about = (
+            f"'{self.uri}' is read as a ROS bag, topic {topic}: {what} ({where}); camera fx"
+            f" {camera.fx:g} fy {camera.fy:g} cx {camera.cx:g} cy {camera.cy:g} ({camera_from})."
+        )
+
+    def read(self, timeout_s: float = 5.0) -> DepthFrame:
+        """Return the next frame; see `DepthSource.read`."""
+        self.check_process()
+        if self._bag is None:
+            raise SourceEndedError(f"'{self.uri}' has been closed.")
+        with readable(self.path):
+            following = self._first or next(self._messages, None)
+            self._first = None
+            if following is None:
+                raise SourceEndedError(f"'{self.uri}' has ended after {self._next} frames.")
+            time_ns, message = following
+            depth_mm = millimetres(self._raw(message), self._scale)
+            frame = DepthFrame(depth_mm, self._next, time_ns // 1000, self.camera, self.uri)
+        self._next += 1
+        return frame
+
+    def close(self) -> None:
+        """Close the bag. Harmless when called twice."""
+        if self._bag is not None:
+            with suppress(Exception):  # of a bag that did not open
+                self._bag.close()
+            self._bag = None
+
+    def _of(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Messages of a topic, each with the time at which it was taken."""
+        wanted = [each for each in self._bag.connections if each.topic == topic]
+        for connection, logged_ns, data in self._bag.messages(connections=wanted):
+            message = self._bag.deserialize(data, connection.msgtype)
+            stamp = getattr(getattr(message, "header", None), "stamp", None)
+            taken_ns = stamp.sec * 10**9 + stamp.nanosec if stamp is not None else 0
+            yield taken_ns or logged_ns, message
+
+    def _choose(self, topic: str) -> str:
+        if topic in self._bag.topics:
+            return topic
+        images: list[str] = [n for n, t in self._bag.topics.items() if t.msgtype in (_IMAGE, _COMPRESSED)]
+        if topic:
+            there = ", ".join(images) or "none"
+            raise SourceNotFoundError(f"'{self.uri}' has no topic '{topic}'; images: {there}.")
+        found = [name for name in images if self._is_depth(name)]
+        found = [name for name in found if name.rpartition("/")[0] not in found]  # raw, if both
+        if len(found) == 1:
+            return found[0]
+        there = f"several: {', '.join(found)}" if found else f"none; images: {', '.join(images)}"
+        raise SourceNotFoundError(
+            f"'{self.uri}' has not one depth topic but {there.rstrip(': ')}; name one with --topic."
+        )
+
+    def _is_depth(self, topic: str) -> bool:
+        _, message = next(self._of(topic), (0, None))
+        if message is None:
+            return False
+        kind = getattr(message, "encoding", None) or message.format
+        # Infrared is mono16 too.
+        return (
+            kind in ("16UC1", "32FC1")
+            or "compressedDepth" in kind
+            or (kind == "mono16" and "depth" in topic.lower())
+        )
+
+    def _raw(self, message: Any) -> npt.NDArray[Any]:
+        if hasattr(message, "format"):
+            return _decompress(bytes(message.data), message.format)
+        kind = _RAW.get(message.encoding)
+        if kind is None:
+            raise SourceNotFoundError(
+                f"topic {self._topic} of '{self.uri}' holds {message.encoding}; depth is {', '.join(_RAW)}."
+            )
+        dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+        rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
+        across = rows[:, : message.width * dtype.itemsize]
+        return np.ascontiguousarray(across).view(dtype).astype(kind)
+
+    def _depth_unit(self, topic: str) -> float | None:
+        """Values per metre, where RealSense's recorder has noted its unit."""
+        sensor = topic.partition("/Depth")[0]
+        name = f"{sensor}/option/Depth_Units/value"
+        _, message = next(self._of(name), (0, None)) if name in self._bag.topics else (0, None)
+        return round(1 / message.data, 3) if message is not None and message.data > 0 else None
+
+    def _camera(
+        self, shape: tuple[int, ...], given: tuple[float, ...] | None, time_ns: int
+    ) -> tuple[Camera, str]:
+        height, width = shape
+        if given is not None:
+            return Camera(width, height, *given), "as given"
+        infos = [name for name, t in self._bag.topics.items() if t.msgtype == _CAMERA]
+        name = max(infos, key=lambda name: _shared(name, self._topic), default="")
+        if _shared(name, self._topic) > 1:
+            info = min(self._of(name), key=lambda item: abs(item[0] - time_ns))[1]
+            k = [float(each) for each in (info.K if hasattr(info, "K") else info.k)]
+            if (info.width, info.height) == (width, height) and k[0] > 0:
+                return Camera(width, height, float(k[0]), float(k[4]), float(k[2]), float(k[5])), name
+            self.notes += (
+                f"{name} is of images of {info.width}x{info.height} pixels, not {width}x{height};"
+                " it is not used. Give --camera fx,fy,cx,cy if you know them.",
+            )
+        return Camera.kinect(width, height), "assumed, a Kinect's"
+
+
+def _shared(one: str, other: str) -> int:
+    """How many parts two topics' names have in common, from the first on."""
+    pairs = list(zip(one.split("/"), other.split("/"), strict=False))
+    return next((n for n, (a, b) in enumerate(pairs) if a != b), len(pairs))
+
+
+def _decompress(data: bytes, kind: str) -> npt.NDArray[Any]:
+    """The image in a compressedDepth message: a header of 12 bytes, then PNG."""
+    at = data.find(_PNG, 0, 64)
+    raw = cv2.imdecode(np.frombuffer(data, np.uint8, offset=max(at, 0)), cv2.IMREAD_UNCHANGED)
+    if at < 0 or raw is None or raw.dtype != np.uint16 or raw.ndim != 2:
+        raise SourceError(f"a message in the form '{kind}' holds no 16-bit PNG, which is read here.")
+    if "32FC1" not in kind:
+        return raw
+    near, far = (float(each) for each in np.frombuffer(data, "<f4", 2, 4))  # of inverse depth
+    metres = near / (np.where(raw > 0, raw, np.inf) - far)
+    return np.where(raw > 0, metres, np.nan).astype(np.float32)

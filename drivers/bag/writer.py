@@ -1,0 +1,134 @@
+"""Writing frames as a ROS 2 bag: one .mcap file, or the folder that ROS 2 records."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from selective_depth.drivers.bag.library import rosbags
+from selective_depth.drivers.errors import OutputError
+from selective_depth.drivers.frame import Camera, DepthFrame
+
+TOPIC = "/camera/depth/image_rect_raw"
+_CAMERA_TOPIC = "/camera/depth/camera_info"
+_FRAME = "camera_depth_optical_frame"
+
+
+class BagWriter:
+    """Writes depth frames as ``sensor_msgs/Image``, 16UC1 in millimetres, with their CameraInfo.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file that ends in ``.mcap``, or a folder for a ROS 2 bag (SQLite). Must not exist; it is
+        there once `close` has ended it.
+
+    Raises
+    ------
+    OutputError
+        If it exists, or cannot be written.
+    SourceError
+        If rosbags is not installed.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._unborn = self.path.with_name(f"{self.path.name}.part")
+        self._mcap = self.path.suffix.lower() == ".mcap"
+        if self.path.exists():
+            raise OutputError(f"'{self.path}' exists already; give another name, or remove it.")
+        types, library = rosbags("typesys"), rosbags("rosbag2")
+        self._store: Any = types.get_typestore(types.Stores.ROS2_HUMBLE)
+        kind = library.StoragePlugin.MCAP if self._mcap else library.StoragePlugin.SQLITE3
+        try:
+            shutil.rmtree(self._unborn, ignore_errors=True)  # what a killed program left
+            self._writer: Any = library.Writer(self._unborn, version=8, storage_plugin=kind)
+            self._writer.open()
+        except (OSError, library.WriterError) as error:
+            raise self._failed(error) from error
+        kinds = {TOPIC: "sensor_msgs/msg/Image", _CAMERA_TOPIC: "sensor_msgs/msg/CameraInfo"}
+        self._topics = {
+            topic: self._writer.add_connection(topic, kind, typestore=self._store)
+            for topic, kind in kinds.items()
+        }
+        self._count = 0
+
+    def write(self, frame: DepthFrame) -> None:
+        """Add a frame.
+
+        Raises
+        ------
+        ValueError
+            If its time is negative, which ROS cannot say.
+        OutputError
+            If it cannot be written, as on a full disk.
+        """
+        if frame.timestamp_us < 0:
+            raise ValueError(
+                f"frame {frame.index} has the time {frame.timestamp_us} us; ROS has none before 0"
+            )
+        types = self._store.types
+        seconds, rest_us = divmod(frame.timestamp_us, 1_000_000)
+        stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest_us * 1000)
+        header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=_FRAME)
+        height, width = frame.shape
+        data = frame.depth_mm.astype("<u2").reshape(-1).view(np.uint8)
+        image = types["sensor_msgs/msg/Image"](
+            header, height, width, encoding="16UC1", is_bigendian=0, step=2 * width, data=data
+        )
+        self._put(_CAMERA_TOPIC, frame.timestamp_us, self._info(header, frame.camera))
+        self._put(TOPIC, frame.timestamp_us, image)
+        self._count += 1
+
+    def close(self) -> None:
+        """Finish the bag and give it its name; without a frame there is none."""
+        if self._writer is None:
+            return
+        writer, self._writer = self._writer, None
+        try:
+            writer.close()
+            if self._count:
+                inner = next(self._unborn.glob("*.mcap")) if self._mcap else self._unborn
+                inner.replace(self.path)
+        except OSError as error:
+            raise self._failed(error) from error
+        finally:
+            shutil.rmtree(self._unborn, ignore_errors=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, OutputError | ValueError):
+            self._count = 0  # a source that failed leaves what it gave; a writer, nothing
+        self.close()
+
+    def _put(self, topic: str, timestamp_us: int, message: Any) -> None:
+        connection = self._topics[topic]
+        data = self._store.serialize_cdr(message, connection.msgtype)
+        try:
+            self._writer.write(connection, timestamp_us * 1000, data)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def _info(self, header: Any, camera: Camera) -> Any:
+        types = self._store.types
+        k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], np.float64)
+        p = np.array([*k[:3], 0, *k[3:6], 0, *k[6:], 0], np.float64)
+        return types["sensor_msgs/msg/CameraInfo"](
+            header, camera.height, camera.width, distortion_model="plumb_bob", d=np.zeros(5), k=k,
+            r=np.eye(3).reshape(-1), p=p, binning_x=0, binning_y=0,
+            roi=types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False),
+        )  # fmt: skip
+
+    def _failed(self, error: Exception) -> OutputError:
+        why = getattr(error, "strerror", None) or str(error)
+        return OutputError(
+            f"'{self.path}' cannot be written ({why}); check the folder, its permissions and the free space."
+        )
