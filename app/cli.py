@@ -184,9 +184,7 @@ def export(source: Source, out: Annotated[Path, arg(metavar="OUT")], /, frames: 
     return save(source, out, frames)
 
 
-@command(
-    "Files", (f"{PROGRAM} model frames/ model --frame 30 --budget 0.05", "a cloud, its depth, its samples")
-)
+@command("Files", (f"{PROGRAM} model frames/ model --frame 30 --budget 0.05", "a cloud, its depth, its samples"))
 def model(
     source: Source,
     out: Annotated[Path, arg(metavar="DIR")],

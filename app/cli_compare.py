@@ -34,9 +34,7 @@ PAGE, FILES, COMPARED, DEFAULTS = (PictureOptions(), EvaluationFiles(), Comparis
     (f"{PROGRAM} nodes frames/", "time, error and regions, on frame 0"),
     (f"{PROGRAM} nodes frames/ --every 60 --out nodes.md", "mean over every 60th frame"),
 )
-def nodes(
-    source: Source, /, every: Limit = None, out: Annotated[Path | None, optional("FILE.md")] = None
-) -> int:
+def nodes(source: Source, /, every: Limit = None, out: Annotated[Path | None, optional("FILE.md")] = None) -> int:
     """Tabulate neural gas over numbers of nodes and of epochs; takes minutes.
 
     Parameters

@@ -23,9 +23,7 @@ def optional(metavar: str) -> Any:
     return arg(metavar=metavar, help_behavior_hint="")
 
 
-def must_be(
-    allowed: str, kind: Callable[[str], Any], good: Callable[[Any], object], *, several: bool = False
-) -> Any:
+def must_be(allowed: str, kind: Callable[[str], Any], good: Callable[[Any], object], *, several: bool = False) -> Any:
     """Describe what an option's value must be; anything else is refused in a sentence.
 
     Parameters
@@ -190,9 +188,7 @@ class PictureOptions:
 
     dpi: Annotated[int, whole(10, 2400)] = 100
     """Pixels per inch."""
-    width: Annotated[
-        float, must_be("from 2 to 60 inches", float, lambda x: 2 <= x <= 60), arg(metavar="INCHES")
-    ] = 16.0
+    width: Annotated[float, must_be("from 2 to 60 inches", float, lambda x: 2 <= x <= 60), arg(metavar="INCHES")] = 16.0
     """Width of the page in inches; type and lines grow with it."""
 
 

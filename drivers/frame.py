@@ -96,9 +96,7 @@ class Camera:
         focal = 585.0 * width / 640.0
         return cls(width, height, focal, focal, width / 2, height / 2)
 
-    def points_mm(
-        self, uv: npt.NDArray[np.generic], depth_mm: npt.NDArray[np.generic]
-    ) -> npt.NDArray[np.float32]:
+    def points_mm(self, uv: npt.NDArray[np.generic], depth_mm: npt.NDArray[np.generic]) -> npt.NDArray[np.float32]:
         """Metric points of pixels: x right, y down, z forward, in millimetres.
 
         Parameters
@@ -207,9 +205,7 @@ class DepthFrame:
         return depth_mm
 
 
-def millimetres(
-    raw: npt.NDArray[np.generic], values_per_metre: float, marks: Sequence[int] = ()
-) -> DepthArray:
+def millimetres(raw: npt.NDArray[np.generic], values_per_metre: float, marks: Sequence[int] = ()) -> DepthArray:
     """Depth in whole millimetres of values of any kind.
 
     What is marked, not finite, below half a millimetre or beyond 65,535 mm becomes 0, no

@@ -8,9 +8,7 @@ from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.options import Options
 from selective_depth.drivers.source import DepthSource
 
-_WHAT_THERE_IS = (
-    "Give an .oni file, a folder of 16-bit PNG frames, 'openni' for a sensor, or 'virtual:workstation'."
-)
+_WHAT_THERE_IS = "Give an .oni file, a folder of 16-bit PNG frames, 'openni' for a sensor, or 'virtual:workstation'."
 
 
 def open_source(uri: str | Path) -> DepthSource:

@@ -43,9 +43,7 @@ class Options:
         for part in filter(None, text.split("&")):
             name, equals, value = part.partition("=")
             if not equals or not value:
-                raise SourceNotFoundError(
-                    f"option '{part}' of {source} has no value; write name=value, with & between"
-                )
+                raise SourceNotFoundError(f"option '{part}' of {source} has no value; write name=value, with & between")
             if name in self._given:
                 raise SourceNotFoundError(f"option '{name}' of {source} is given twice; keep one")
             self._given[name] = value
@@ -160,6 +158,4 @@ class Options:
         """Refuse what is left, naming what there is."""
         if self._given:
             unknown = ", ".join(f"'{name}'" for name in sorted(self._given))
-            raise SourceNotFoundError(
-                f"{self._source} has no option {unknown}; it has {', '.join(self._known)}"
-            )
+            raise SourceNotFoundError(f"{self._source} has no option {unknown}; it has {', '.join(self._known)}")

@@ -40,9 +40,7 @@ def measured_mm(depth: npt.ArrayLike, name: str = "depth_mm") -> npt.NDArray[np.
     """
     given = np.ma.getdata(depth)
     if given.dtype.kind not in "uif":
-        raise ValueError(
-            f"{name} is of type {given.dtype}; give numbers, depth in millimetres and 0 for none"
-        )
+        raise ValueError(f"{name} is of type {given.dtype}; give numbers, depth in millimetres and 0 for none")
     with np.errstate(over="ignore"):  # of a double: infinite, and so missing
         mm = np.array(given, np.float32, order="C")
     mm[~((mm > 0) & (mm <= FARTHEST_MM)) | np.ma.getmask(depth)] = 0
@@ -54,8 +52,7 @@ def warn_of_metres(given: npt.ArrayLike, mm: npt.NDArray[np.float32], name: str)
     farthest = float(mm.max(initial=0))
     if np.ma.getdata(given).dtype.kind == "f" and 0 < farthest < _METRES:
         warnings.warn(
-            f"the greatest depth in {name} is {farthest:g} mm; if these are metres, multiply by 1000",
-            stacklevel=3,
+            f"the greatest depth in {name} is {farthest:g} mm; if these are metres, multiply by 1000", stacklevel=3
         )
 
 
@@ -71,9 +68,7 @@ def pixels_in(uv: npt.ArrayLike, shape: tuple[int, int], name: str = "uv") -> np
     given = np.ma.getdata(uv)
     height, width = shape
     if given.ndim != 2 or given.shape[1] != 2 or (given.dtype.kind not in "ui" and given.size):
-        raise ValueError(
-            f"{name} must be whole numbers of shape (n, 2), column first, got {given.dtype} {given.shape}"
-        )
+        raise ValueError(f"{name} must be whole numbers of shape (n, 2), column first, got {given.dtype} {given.shape}")
     if np.ma.getmask(uv).any():
         raise ValueError(f"{name} has masked elements; leave out the pixels that are not meant")
     if len(given):
@@ -111,9 +106,7 @@ def checked_map(values: npt.ArrayLike, shape: tuple[int, int], name: str) -> npt
     """
     given = np.ma.getdata(values)
     if given.shape != shape or given.dtype.kind not in "buif":
-        raise ValueError(
-            f"{name} must be a number for every pixel, of shape {shape}, got {given.dtype} {given.shape}"
-        )
+        raise ValueError(f"{name} must be a number for every pixel, of shape {shape}, got {given.dtype} {given.shape}")
     greatest = np.finfo(np.float32).max
     with np.errstate(over="ignore"):
         worth = np.array(given, np.float32, order="C")

@@ -74,9 +74,7 @@ class Samples:
         Least depth that returned; infinite before the first.
     """
 
-    def __init__(
-        self, frame_shape: tuple[int, int], pitch_px: float = 5.0, seeds: SeedGrid | None = None
-    ) -> None:
+    def __init__(self, frame_shape: tuple[int, int], pitch_px: float = 5.0, seeds: SeedGrid | None = None) -> None:
         height, width = self.frame_shape = frame_shape
         self.pitch_px = pitch_px
         self._seeds = seeds

@@ -193,9 +193,7 @@ class SeedGrid:
         """Metric points of the seeds that returned depth, shape (n, 3), row by row."""
         return np.ascontiguousarray(self.lattice_points_mm[self.valid])
 
-    def points_at(
-        self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.float32]
-    ) -> npt.NDArray[np.float32]:
+    def points_at(self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Metric points of pixels (..., 2) of the frame with these depths, shape (..., 3).
 
         Without a camera, the rays between the seeds' own are interpolated.
@@ -222,9 +220,7 @@ class SeedGrid:
         return np.asarray(ray * depth_mm[..., None], np.float32)
 
 
-def answers(
-    measure: Measure, uv: npt.NDArray[np.int32]
-) -> tuple[npt.NDArray[np.generic], npt.NDArray[np.float32]]:
+def answers(measure: Measure, uv: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.generic], npt.NDArray[np.float32]]:
     """Ask a sensor for pixels (n, 2): its own answer, and depth (n,) in mm, 0 = no return.
 
     Raises

@@ -59,9 +59,7 @@ class Selection:
 
     def __post_init__(self) -> None:
         if self.mask.dtype != np.bool_ or self.mask.ndim != 2:
-            raise ValueError(
-                f"mask must be bool of shape (height, width), got {self.mask.dtype} {self.mask.shape}"
-            )
+            raise ValueError(f"mask must be bool of shape (height, width), got {self.mask.dtype} {self.mask.shape}")
         if self.score.dtype != np.float32 or self.score.shape != self.mask.shape:
             raise ValueError(
                 f"score must be float32 of shape {self.mask.shape}, got {self.score.dtype} {self.score.shape}"
@@ -136,9 +134,7 @@ class FunctionSelector:
         ValueError
             If it does not answer with a number for every pixel.
         """
-        worth = checked_map(
-            self.function(Samples.of(samples)), samples.frame_shape, f"the answer of {self.name}"
-        )
+        worth = checked_map(self.function(Samples.of(samples)), samples.frame_shape, f"the answer of {self.name}")
         return Selection.of_score(worth, self.name)
 
 

@@ -18,10 +18,7 @@ from selective_depth.drivers.open import open_source
 
 RECORDINGS = Path(__file__).parent.parent / "recordings"
 ORIGINAL = "virtual:workstation?frames=30&speed=2&seed=7"
-OTHERS = {
-    "ball": "virtual:ball?frames=8&speed=2&seed=7",
-    "firehose": "virtual:firehose?frames=8&speed=2&seed=7",
-}
+OTHERS = {"ball": "virtual:ball?frames=8&speed=2&seed=7", "firehose": "virtual:firehose?frames=8&speed=2&seed=7"}
 LIMIT_MB = 12
 
 

@@ -106,9 +106,7 @@ def summarise(durations_ms: list[float]) -> StageSummary:
     return StageSummary(float(p50), float(p99), max(durations_ms), len(durations_ms))
 
 
-def bench(
-    source: str, frames: int | None = None, *, peers: bool = True, say: Say = lambda text: None
-) -> BenchReport:
+def bench(source: str, frames: int | None = None, *, peers: bool = True, say: Say = lambda text: None) -> BenchReport:
     """Time every stage over the frames of a source, one after the other.
 
     Parameters
@@ -177,9 +175,7 @@ def _time_neural_gas(seeds: list[SeedGrid], durations: Durations, say: Say) -> N
     some = seeds[:: max(1, len(seeds) // EXACT_FRAMES)][:EXACT_FRAMES]
     train_exact(some[0].points_mm[:64], 16, 1, seed=0)  # compiles
     _timed(
-        durations,
-        "neural_gas_exact",
-        (partial(train_exact, grid.points_mm, NODES, EPOCHS, seed=0) for grid in some),
+        durations, "neural_gas_exact", (partial(train_exact, grid.points_mm, NODES, EPOCHS, seed=0) for grid in some)
     )
     say("neural gas, fast and live")
     live = BatchNeuralGas(NODES, seed=0)

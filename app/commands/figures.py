@@ -19,23 +19,12 @@ from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import check_output, check_picture, write_output
 from selective_depth.app.console.progress import waiting
 from selective_depth.app.pictures import Panel, sheet, write_picture
-from selective_depth.app.pictures.panels import (
-    backdrop,
-    draw_kept_triangles,
-    draw_nodes,
-    shaded_panel,
-    tinted,
-)
+from selective_depth.app.pictures.panels import backdrop, draw_kept_triangles, draw_nodes, shaded_panel, tinted
 from selective_depth.app.pictures.sheets import WIDTH_IN, Row
 from selective_depth.app.pipeline import open_and_tell, say
 from selective_depth.app.settings import PictureOptions
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.selectors.neural_gas import (
-    EdgeMetric,
-    NeuralGasSelector,
-    RegionSelection,
-    delaunay_regions,
-)
+from selective_depth.selectors.neural_gas import EdgeMetric, NeuralGasSelector, RegionSelection, delaunay_regions
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.seeds import SeedGrid
 
@@ -137,19 +126,14 @@ def epochs_figure(
         Width of the page in inches.
     """
     columns = [
-        (f"{length} epochs", f"error {chosen['3d'].quantisation_error_mm:.1f} mm", chosen)
-        for length, chosen in trained
+        (f"{length} epochs", f"error {chosen['3d'].quantisation_error_mm:.1f} mm", chosen) for length, chosen in trained
     ]
     nodes = len(trained[0][1]["3d"].nodes_mm)
     return _figure(frame, f"{len(seeds.uv):,} points, {nodes:,} nodes", columns, width_in)
 
 
 def densities_figure(
-    frame: DepthFrame,
-    sides: Sequence[int] = DENSITIES,
-    epochs: int = 50,
-    seed: int = 0,
-    width_in: float = WIDTH_IN,
+    frame: DepthFrame, sides: Sequence[int] = DENSITIES, epochs: int = 50, seed: int = 0, width_in: float = WIDTH_IN
 ) -> Figure:
     """Fig. 2 of the paper: areas of interest from first scans of several densities.
 
@@ -178,10 +162,7 @@ def densities_figure(
 
 
 def _figure(
-    frame: DepthFrame,
-    note: str,
-    columns: Sequence[tuple[str, str, dict[EdgeMetric, RegionSelection]]],
-    width_in: float,
+    frame: DepthFrame, note: str, columns: Sequence[tuple[str, str, dict[EdgeMetric, RegionSelection]]], width_in: float
 ) -> Figure:
     """The object, then a column per training: nodes above, kept triangles by each metric below."""
     first = shaded_panel(frame, "Object", note)
@@ -268,9 +249,7 @@ def node_table(
             yield TableRow(count, f"{length} epochs" if length else "fast", *means)
 
 
-def _squared_error(
-    frame: DepthFrame, seeds: SeedGrid
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+def _squared_error(frame: DepthFrame, seeds: SeedGrid) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
     """Squared error of the frame interpolated from its seeds, and where it is known."""
     known = frame.depth_mm > 0
     model = reconstruct(seeds.uv, seeds.depth_mm[seeds.valid], frame.shape)
@@ -287,16 +266,10 @@ def table_markdown(rows: Sequence[TableRow]) -> str:
     for row in rows:
         shares = " | ".join(
             f"{share:.1%}"
-            for share in (
-                row.mask_share,
-                row.mask_error_share,
-                row.complement_share,
-                row.complement_error_share,
-            )
+            for share in (row.mask_share, row.mask_error_share, row.complement_share, row.complement_error_share)
         )
         lines.append(
-            f"| {row.nodes:,} | {row.training} | {row.seconds:.3g} |"
-            f" {row.quantisation_error_mm:.2f} | {shares} |"
+            f"| {row.nodes:,} | {row.training} | {row.seconds:.3g} | {row.quantisation_error_mm:.2f} | {shares} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -304,9 +277,7 @@ def table_markdown(rows: Sequence[TableRow]) -> str:
 # The commands
 
 
-def draw_epochs(
-    source: str, out: Path, *, save: Path | None, number: int, seed: int, page: PictureOptions
-) -> int:
+def draw_epochs(source: str, out: Path, *, save: Path | None, number: int, seed: int, page: PictureOptions) -> int:
     """Make Fig. 1 of a frame of a source, and a Rerun recording of it; returns the exit code.
 
     Raises
@@ -332,9 +303,7 @@ def draw_epochs(
     return OK
 
 
-def draw_densities(
-    source: str, out: Path, *, number: int, epochs: int, seed: int, page: PictureOptions
-) -> int:
+def draw_densities(source: str, out: Path, *, number: int, epochs: int, seed: int, page: PictureOptions) -> int:
     """Make Fig. 2 of a frame of a source; returns the exit code. Raises as `draw_epochs`."""
     check_picture(out)
     frame = nth_frame(source, number)
@@ -359,8 +328,7 @@ def tabulate_nodes(source: str, *, every: int | None, out: Path | None) -> int:
     with open_and_tell(source) as opened:
         if every is not None and opened.frame_count is None:
             raise UsageError(
-                f"'{source}' never ends; record some of it first, or leave out --every to take"
-                " its first frame."
+                f"'{source}' never ends; record some of it first, or leave out --every to take its first frame."
             )
         frames = list(islice(opened, 0, None if every else 1, every or 1))
     if not frames:

@@ -90,9 +90,7 @@ def export(source: str, out: Path, frames: int | None) -> int:
         else:
             with open_and_tell(source) as opened:
                 if opened.frame_count is None and frames is None:
-                    raise UsageError(
-                        f"'{source}' never ends; say how many frames to save, as in --frames 100."
-                    )
+                    raise UsageError(f"'{source}' never ends; say how many frames to save, as in --frames 100.")
                 count = _save(opened, out, frames, progress)
                 camera = opened.camera
             middle = (camera.width / 2, camera.height / 2)

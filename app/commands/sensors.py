@@ -49,9 +49,7 @@ def print_devices() -> int:
     return OK
 
 
-def record_sensor(
-    out: Path, device: str, *, frames: int | None, seconds: float | None, overwrite: bool
-) -> int:
+def record_sensor(out: Path, device: str, *, frames: int | None, seconds: float | None, overwrite: bool) -> int:
     """Record a sensor and say what became of it.
 
     Returns

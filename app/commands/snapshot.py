@@ -37,8 +37,7 @@ def nth_frame(uri: str, number: int) -> DepthFrame:
                 frame = source.read()
             except SourceEndedError:
                 raise UsageError(
-                    f"--frame is {number}, but '{uri}' has {reached} frames; the last is"
-                    f" --frame {reached - 1}."
+                    f"--frame is {number}, but '{uri}' has {reached} frames; the last is --frame {reached - 1}."
                 ) from None
     return frame
 
@@ -52,9 +51,7 @@ def still_row(frame: DepthFrame, title: str, settings: Settings) -> StillRow:
     return StillRow(title, frame, result.regions, result.improvement, result.acquisition)
 
 
-def snapshot(
-    sources: Sequence[str], number: int, out: Path, settings: Settings, page: PictureOptions
-) -> list[Path]:
+def snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings, page: PictureOptions) -> list[Path]:
     """Write a contact sheet with a row per source, and each panel alone.
 
     Parameters
@@ -104,9 +101,7 @@ def snapshot(
     return written
 
 
-def draw_snapshot(
-    sources: Sequence[str], number: int, out: Path, settings: Settings, page: PictureOptions
-) -> int:
+def draw_snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings, page: PictureOptions) -> int:
     """Make a `snapshot` and say what was written; returns the exit code."""
     with waiting("Running both selectors"):
         written = snapshot(sources, number, out, settings, page)

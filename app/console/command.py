@@ -77,9 +77,7 @@ class Command:
         """Summary, examples, and the rest of the docstring but for its parameters."""
         text = (inspect.getdoc(self.run) or "").partition("\nParameters\n")[0]
         summary, _, rest = text.partition("\n")
-        return "\n".join(
-            [summary, "", "Examples:", *_example_lines(self.examples), *rest.rstrip().split("\n")]
-        )
+        return "\n".join([summary, "", "Examples:", *_example_lines(self.examples), *rest.rstrip().split("\n")])
 
 
 COMMANDS: dict[str, Command] = {}
@@ -218,9 +216,7 @@ def with_source_options(call: Callable[[], int | None], given: dict[str, str]) -
     for name in names:
         value = bound.arguments[name]
         bound.arguments[name] = (
-            appended(value, given)
-            if isinstance(value, str)
-            else tuple(appended(each, given) for each in value)
+            appended(value, given) if isinstance(value, str) else tuple(appended(each, given) for each in value)
         )
     return functools.partial(run, *bound.args, **bound.kwargs)
 

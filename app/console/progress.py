@@ -11,15 +11,7 @@ from types import TracebackType
 from typing import Self
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
 PATIENCE_S = 2.0
 """A wait longer than this is explained."""
@@ -77,9 +69,7 @@ class FrameProgress:
             self._bar.update(self._task, completed=frames, note=note)
             return
         now = time.monotonic()
-        if now - self._start_s > PATIENCE_S and (
-            self._said_s == self._start_s or now - self._said_s > REPEAT_S
-        ):
+        if now - self._start_s > PATIENCE_S and (self._said_s == self._start_s or now - self._said_s > REPEAT_S):
             self._said_s = now
             total = f" of {self._total}" if self._total else ""
             sys.stderr.write(f"{self._what}: {frames}{total} frames {note}".rstrip() + "\n")

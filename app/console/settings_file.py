@@ -47,9 +47,7 @@ def _one_line(text: str) -> str:
 def _stated(table: dict[str, Any]) -> dict[str, Any]:
     """A table without what is None, which TOML does not have."""
     return {
-        key: _stated(value) if isinstance(value, dict) else value
-        for key, value in table.items()
-        if value is not None
+        key: _stated(value) if isinstance(value, dict) else value for key, value in table.items() if value is not None
     }
 
 

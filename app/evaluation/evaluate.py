@@ -121,8 +121,7 @@ def _evaluate_frame(
         for name in strategies:
             draws = random_seeds if strategy_of(name).chance else 1
             errors = tuple(
-                run_strategy(name, Case(frame, seeds_shape, shots, rounds, seed, settings))
-                for seed in range(draws)
+                run_strategy(name, Case(frame, seeds_shape, shots, rounds, seed, settings)) for seed in range(draws)
             )
             outcomes.append(Outcome(label, budget, name, errors, frame.source, frame.index, measured))
     return outcomes
@@ -239,9 +238,7 @@ def outcomes(
     else:
         _spread(chosen, arguments, jobs, keep)
     if not found:
-        raise SourceNotFoundError(
-            f"no frame with depth in {', '.join(sources)}; give another source or --every 1."
-        )
+        raise SourceNotFoundError(f"no frame with depth in {', '.join(sources)}; give another source or --every 1.")
     progress(len(found), len(found))
     return [outcome for number in sorted(found) for outcome in found[number]]
 

@@ -39,8 +39,7 @@ def _in_full(found: Sequence[Outcome]) -> dict[str, dict[str, dict[str, float]]]
     """`summarise`, with every figure under its full name as well as its short one."""
     return {
         budget: {
-            name: figures | {FULL_WORDS[key]: figures[key] for key in FULL_WORDS}
-            for name, figures in table.items()
+            name: figures | {FULL_WORDS[key]: figures[key] for key in FULL_WORDS} for name, figures in table.items()
         }
         for budget, table in summarise(found).items()
     }
@@ -135,9 +134,7 @@ def curves(found: Sequence[Outcome], width_in: float) -> Figure:
         axes = figure.add_subplot()
         names = list(next(iter(results.values())))
         for at, name in enumerate(n for n in names if not strategy_of(n).reference):
-            points = [
-                (measured[f"{float(budget):g}"], table[name]["rmse_mm"]) for budget, table in results.items()
-            ]
+            points = [(measured[f"{float(budget):g}"], table[name]["rmse_mm"]) for budget, table in results.items()]
             style = ("-", "--", ":", "-.")[at // 10 % 4]
             bold = 3.0 if name == "loop" else 1.4
             axes.plot(*zip(*sorted(points), strict=True), style, marker="o", linewidth=bold,

@@ -184,9 +184,7 @@ def run_over_time(
         _print(uri, found[uri], float(options.budget[0]))
     if files.json is not None:
         document = {
-            "over_time": {
-                uri: {way: asdict(course) for way, course in ways.items()} for uri, ways in found.items()
-            },
+            "over_time": {uri: {way: asdict(course) for way, course in ways.items()} for uri, ways in found.items()},
             "budget": options.budget[0],
         }
         write_output(files.json, json.dumps(document, indent=1) + "\n")

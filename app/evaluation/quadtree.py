@@ -82,10 +82,7 @@ def quadtree(measure: Measure, seeds: SeedGrid, shots: int) -> npt.NDArray[np.in
             known |= dict(zip(new, answers.tolist(), strict=True))
             order += new
             left_over -= len(new)
-        error = {
-            pixel: abs(known[pixel] - expected[pixel]) if known.get(pixel, 0) > 0 else 0.0
-            for pixel in expected
-        }
+        error = {pixel: abs(known[pixel] - expected[pixel]) if known.get(pixel, 0) > 0 else 0.0 for pixel in expected}
         if left_over > 0:
             for a, b in ((u0, middle_u), (middle_u, u1)):
                 for c, d in ((v0, middle_v), (middle_v, v1)):

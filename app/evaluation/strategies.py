@@ -202,9 +202,7 @@ def _selected(case: Case, name: str, *, loop: bool) -> Pixels:
 def _driven(name: str, about: str, chance: bool) -> dict[str, Strategy]:
     """A selector in one shot and in the loop."""
     return {
-        f"{name}/{kind}": Strategy(
-            f"{about}, {words}", partial(_selected, name=name, loop=kind == "loop"), chance
-        )
+        f"{name}/{kind}": Strategy(f"{about}, {words}", partial(_selected, name=name, loop=kind == "loop"), chance)
         for kind, words in (("one-shot", "one shot"), ("loop", "closed loop"))
     }
 
@@ -216,9 +214,7 @@ STRATEGIES: dict[str, Strategy] = {
     "variance": Strategy(
         "largest kriging variance, local fits", lambda c: c.best(np.nan_to_num(c.improvement.variance_mm2))
     ),
-    "neural_gas": Strategy(
-        "neural gas, published rule, even spread", lambda c: c.spread(c.regions.mask), chance=True
-    ),
+    "neural_gas": Strategy("neural gas, published rule, even spread", lambda c: c.spread(c.regions.mask), chance=True),
     "neural_gas_complement": Strategy(
         "neural gas, long-edge complement, even spread", lambda c: c.spread(c.regions.complement), chance=True
     ),
@@ -227,16 +223,12 @@ STRATEGIES: dict[str, Strategy] = {
         "published improvement, closed loop", lambda c: _selected(c, "improvement", loop=True)
     ),
     "gradient": Strategy("gradient of the interpolated depth, one shot", _gradient),
-    "quadtree": Strategy(
-        "quad-tree, largest error split first", lambda c: quadtree(c.frame.measure, c.seeds, c.shots)
-    ),
+    "quadtree": Strategy("quad-tree, largest error split first", lambda c: quadtree(c.frame.measure, c.seeds, c.shots)),
     "step": Strategy("step score, one shot", lambda c: _loop(c, 1)),
     "loop": Strategy("surface score, closed loop: the default", lambda c: _loop(c, c.rounds)),
     "oracle": Strategy("largest true error, 16 batches", _oracle),
     "uniform_x3": Strategy(
-        "a fresh lattice, 3 times the samples",
-        lambda c: c.lattice(3 * (len(c.seed_uv) + c.shots)),
-        reference=True,
+        "a fresh lattice, 3 times the samples", lambda c: c.lattice(3 * (len(c.seed_uv) + c.shots)), reference=True
     ),
     "uniform_70": Strategy(
         "a lattice of 70 % of all pixels", lambda c: c.lattice(0.7 * c.frame.depth_mm.size), reference=True
@@ -274,7 +266,6 @@ def strategies_of(names: Sequence[str]) -> tuple[str, ...]:
             meant += [each for each in _driven(by, "", chance=False) if each.startswith(name)]
         else:
             raise UsageError(
-                f"--strategies has '{name}'; it takes main, all, FILE.py:NAME, or names out of"
-                f" {', '.join(STRATEGIES)}."
+                f"--strategies has '{name}'; it takes main, all, FILE.py:NAME, or names out of {', '.join(STRATEGIES)}."
             )
     return tuple(dict.fromkeys(meant))

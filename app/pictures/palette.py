@@ -101,16 +101,7 @@ FIGURES = {
 }
 """Running figures of a frame: how a plot calls and colours them."""
 
-STAGE_COLOURS = (
-    0x999999FF,
-    0x56B4E9FF,
-    0x26A69AFF,
-    0xE69F00FF,
-    0xCC79A7FF,
-    0xB8A100FF,
-    0xD55E00FF,
-    0x8C6BD6FF,
-)
+STAGE_COLOURS = (0x999999FF, 0x56B4E9FF, 0x26A69AFF, 0xE69F00FF, 0xCC79A7FF, 0xB8A100FF, 0xD55E00FF, 0x8C6BD6FF)
 """Colours of `timing.STAGES`, after Okabe and Ito: safe for colour-blind eyes,
 and to be seen on the viewer's dark background and on its light one."""
 
@@ -187,11 +178,7 @@ def picture(limits_mm: tuple[float, float], rounds: int) -> Image:
         ramps.append(("acquired in", round_colours(rounds)[1:], "round 1", last))
         limit = f"{ERROR.limits[1]:.0f} {ERROR.unit}"
         ramps.append((ERROR.quantity, palette(ERROR.colormap), "0", limit))
-    swatches = [
-        (UNKNOWN, HOLE),
-        ("kept triangles: the regions selected", REGION | 0xFF),
-        ("neural-gas nodes", NODE),
-    ]
+    swatches = [(UNKNOWN, HOLE), ("kept triangles: the regions selected", REGION | 0xFF), ("neural-gas nodes", NODE)]
     image = np.full((_ROW * (len(ramps) + len(swatches)) + 20, 760, 3), BACKGROUND, np.uint8)
     for row, (name, ramp, low, high) in enumerate(ramps):
         base = _ROW * row + 44

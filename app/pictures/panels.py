@@ -143,9 +143,7 @@ def improvement_panel(improvement: ImprovementSelection) -> Panel:
     return Panel("improvement", "Improvement map", image, palette.IMPROVEMENT, "eq. (23)")
 
 
-def shots_panel(
-    frame: DepthFrame, uv: npt.NDArray[np.integer], rounds: npt.NDArray[np.integer], caption: str
-) -> Panel:
+def shots_panel(frame: DepthFrame, uv: npt.NDArray[np.integer], rounds: npt.NDArray[np.integer], caption: str) -> Panel:
     """Where measurements were taken, by round; those of round 0, the seeds, are not drawn."""
     image = backdrop(frame)
     last = max(int(rounds.max(initial=1)), 1)
@@ -175,11 +173,7 @@ def error_panel(frame: DepthFrame, model_mm: npt.NDArray[np.float32], caption: s
 
 def panels_of(row: StillRow) -> list[Panel]:
     """Every panel of one source, left to right."""
-    shown = [
-        depth_panel(row.frame),
-        regions_panel(row.frame, row.regions),
-        improvement_panel(row.improvement),
-    ]
+    shown = [depth_panel(row.frame), regions_panel(row.frame, row.regions), improvement_panel(row.improvement)]
     if row.acquisition is not None:
         shown.append(samples_panel(row.frame, row.acquisition))
         shown.append(error_panel(row.frame, row.acquisition.reconstruct(), "Model error"))

@@ -152,10 +152,7 @@ def _caption(axes: Axes, panel: Panel, each: float, tall: float, zoom: float) ->
     if panel.scale is None:
         return
     (low, high), unit = panel.scale.limits, panel.scale.unit
-    if unit == "round":
-        colours = palette.round_colours(round(high))[1:]
-    else:
-        colours = palette.palette(panel.scale.colormap)
+    colours = palette.round_colours(round(high))[1:] if unit == "round" else palette.palette(panel.scale.colormap)
     bar = axes.inset_axes((0, -0.18 / tall, _BAR, 0.1 / tall))
     bar.imshow(palette.channels(colours)[None], aspect="auto")
     bar.set_axis_off()

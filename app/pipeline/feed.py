@@ -8,12 +8,7 @@ from typing import NamedTuple
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.pipeline.report import say
-from selective_depth.drivers.errors import (
-    DamagedRecordingError,
-    DeviceLostError,
-    SourceEndedError,
-    SourceTimeoutError,
-)
+from selective_depth.drivers.errors import DamagedRecordingError, DeviceLostError, SourceEndedError, SourceTimeoutError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.source import DepthSource

@@ -211,14 +211,10 @@ class Pipeline:
         with self.times.stage("acquire", stages_ms):
             return self._memory.step(frame.measure)
 
-    def _told_by(
-        self, step: TemporalStep, frame: DepthFrame, stages_ms: dict[str, float]
-    ) -> tuple[Acquisition, Model]:
+    def _told_by(self, step: TemporalStep, frame: DepthFrame, stages_ms: dict[str, float]) -> tuple[Acquisition, Model]:
         """What the memory measured in a frame, and its model held against it."""
         with self.times.stage("model", stages_ms):
-            acquisition = Acquisition(
-                step.uv, step.depth_mm, step.batch, frame.shape, (), f"{step.by}, with memory"
-            )
+            acquisition = Acquisition(step.uv, step.depth_mm, step.batch, frame.shape, (), f"{step.by}, with memory")
             return acquisition, Model.of(step.model_mm, frame)
 
     def _model_of_some(self, frame: DepthFrame, acquisition: Acquisition) -> Model | None:
@@ -232,9 +228,7 @@ class Pipeline:
             self._since_model = 0
         return done.result() if done else None
 
-    def _model(
-        self, frame: DepthFrame, acquisition: Acquisition, stages_ms: dict[str, float] | None = None
-    ) -> Model:
+    def _model(self, frame: DepthFrame, acquisition: Acquisition, stages_ms: dict[str, float] | None = None) -> Model:
         with self.times.stage("model", stages_ms):
             return Model.of(acquisition.reconstruct(self._threads), frame)
 

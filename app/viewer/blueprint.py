@@ -40,8 +40,7 @@ def blueprint(
     columns: list[rrb.Container | rrb.View] = [
         rrb.Vertical(_image("1 Sensor", "depth", "holes"), _image("2 Seeds", "seeds")),
         rrb.Vertical(
-            rrb.Tabs(gas, gas_long) if detail else gas,
-            rrb.Tabs(score, estimate, deviation) if detail else score,
+            rrb.Tabs(gas, gas_long) if detail else gas, rrb.Tabs(score, estimate, deviation) if detail else score
         ),
     ]
     space = ["/camera", "/camera/depth", "/world/nodes", "/world/regions"]
@@ -61,9 +60,7 @@ def blueprint(
         eye_up=(0, -1, 0),
     )
     columns.append(
-        rrb.Spatial3DView(
-            origin="/", contents=space, name="In space", eye_controls=eye, background=legend.BACKGROUND
-        )
+        rrb.Spatial3DView(origin="/", contents=space, name="In space", eye_controls=eye, background=legend.BACKGROUND)
     )
     shares = [1.0] * (len(columns) - 1) + [1.6]
     return rrb.Blueprint(
@@ -98,9 +95,7 @@ def _figures(memory: bool) -> rrb.Horizontal:
 
     def plot(name: str, *figures: str) -> rrb.TimeSeriesView:
         contents = [f"/figures/{figure}" for figure in figures]
-        return rrb.TimeSeriesView(
-            origin="/figures", contents=contents, name=name, plot_legend=rrb.Corner2D.LeftTop
-        )
+        return rrb.TimeSeriesView(origin="/figures", contents=contents, name=name, plot_legend=rrb.Corner2D.LeftTop)
 
     errors = ("rmse_mm", "truth_rmse_mm", "sensor_rmse_mm")
     return rrb.Horizontal(
@@ -125,9 +120,7 @@ def epoch_blueprint(limits_mm: tuple[float, float]) -> rrb.Blueprint:
     error = rrb.TimeSeriesView(origin="/figures", name="Quantisation error in mm")
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(
-                _image("Nodes", "gas/nodes", over=grey), _image("Long edges", "gas/complement", over=grey)
-            ),
+            rrb.Vertical(_image("Nodes", "gas/nodes", over=grey), _image("Long edges", "gas/complement", over=grey)),
             _image("Kept triangles", "gas/mask", "gas/triangles", over=grey),
             rrb.Vertical(space, error, row_shares=[2, 1]),
         ),

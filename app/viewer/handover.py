@@ -53,9 +53,7 @@ class Handover(Generic[T]):
         What ended the sink before its time; nothing is taken any more.
     """
 
-    def __init__(
-        self, name: str, sink: Sink[T], *, lossless: bool, patience_s: float = 0.0, capacity: int = 2
-    ) -> None:
+    def __init__(self, name: str, sink: Sink[T], *, lossless: bool, patience_s: float = 0.0, capacity: int = 2) -> None:
         self.name = name
         self.dropped = 0
         self.failure: Exception | None = None

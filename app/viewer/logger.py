@@ -177,9 +177,7 @@ class StepLogger:
         if acquisition is None:
             return
         shot = acquisition.round > 0
-        uv, depth_mm, rounds = (
-            array[shot] for array in (acquisition.uv, acquisition.depth_mm, acquisition.round)
-        )
+        uv, depth_mm, rounds = (array[shot] for array in (acquisition.uv, acquisition.depth_mm, acquisition.round))
         colours = legend.round_colours(int(rounds.max(initial=0)))[rounds]
         log("camera/samples", rr.Points2D(uv + CENTRE, colors=colours, radii=0.9))
         hit = depth_mm > 0
@@ -207,9 +205,7 @@ class StepLogger:
                 log(f"figures/{name}", rr.Scalars(value))
 
     def _depth_image(self, depth_mm: npt.NDArray[np.uint16]) -> rr.DepthImage:
-        return rr.DepthImage(
-            depth_mm, meter=1000.0, colormap=legend.DEPTH_COLOURMAP, depth_range=list(self._limits_mm)
-        )
+        return rr.DepthImage(depth_mm, meter=1000.0, colormap=legend.DEPTH_COLOURMAP, depth_range=list(self._limits_mm))
 
 
 def _middle_m(depth_mm: npt.NDArray[np.uint16]) -> float:
@@ -222,9 +218,7 @@ def _as_depth(value_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
     return np.where(value_mm > 0, value_mm, np.float32(0)).astype(np.uint16)
 
 
-def _map_image(
-    value: npt.NDArray[np.float32], scale: legend.Scale, known: npt.NDArray[np.bool_]
-) -> rr.DepthImage:
+def _map_image(value: npt.NDArray[np.float32], scale: legend.Scale, known: npt.NDArray[np.bool_]) -> rr.DepthImage:
     """Values on a scale from 0 as a coloured 8-bit image: 1..255, and 0 where nothing is known."""
     # Saturates in one pass; what it makes of a NaN does not matter, that is nowhere known.
     levels = np.asarray(cv2.convertScaleAbs(value, alpha=254 / scale.limits[1], beta=1))

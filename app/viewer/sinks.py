@@ -249,9 +249,7 @@ class RemotePlace(Place):
         """See that a viewer listens, and which."""
         listener = ask(self.url) if listens(self._address) else None
         if listener is None:
-            raise ViewerError(
-                f"no viewer listens at {self.url}. Start one there with 'rerun', or leave out --connect."
-            )
+            raise ViewerError(f"no viewer listens at {self.url}. Start one there with 'rerun', or leave out --connect.")
         if not listener.rerun:
             raise ViewerError(f"what listens at {self.url} is {listener.name}, no Rerun viewer.")
         if not listener.fits:

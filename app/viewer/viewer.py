@@ -118,8 +118,7 @@ class Viewer:
             path.parent.mkdir(exist_ok=True)
         except OSError as error:
             raise OutputError(
-                f"'{path}' cannot be written: {error.strerror}. Name another file with --save, or"
-                " none with --headless."
+                f"'{path}' cannot be written: {error.strerror}. Name another file with --save, or none with --headless."
             ) from None
         self._places.insert(0, FilePlace(path, showing, index=self._index))
         self.options = dataclasses.replace(self.options, save=path)

@@ -232,9 +232,7 @@ def _start(port: int, options: ViewerOptions) -> bool | None:
                 env={"RUST_LOG": "error", "RERUN_APP_ONLY": "true"} | os.environ,
             )
         except OSError as error:
-            raise ViewerError(
-                f"the viewer window does not start: '{executable}': {error.strerror}."
-            ) from None
+            raise ViewerError(f"the viewer window does not start: '{executable}': {error.strerror}.") from None
         try:
             return _is_born(process, port, complaints)
         except BaseException:

@@ -23,9 +23,7 @@ def rosbags(module: str) -> Any:
     try:
         return importlib.import_module(f"rosbags.{module}")
     except ImportError as error:
-        raise SourceError(
-            "ROS bags need the package rosbags (no ROS): pip install 'selective-depth[ros]'."
-        ) from error
+        raise SourceError("ROS bags need the package rosbags (no ROS): pip install 'selective-depth[ros]'.") from error
 
 
 @contextmanager

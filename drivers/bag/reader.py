@@ -150,9 +150,7 @@ class BagReader(DepthSource):
         kind = getattr(message, "encoding", None) or message.format
         # Infrared is mono16 too.
         return (
-            kind in ("16UC1", "32FC1")
-            or "compressedDepth" in kind
-            or (kind == "mono16" and "depth" in topic.lower())
+            kind in ("16UC1", "32FC1") or "compressedDepth" in kind or (kind == "mono16" and "depth" in topic.lower())
         )
 
     def _raw(self, message: Any) -> npt.NDArray[Any]:
@@ -175,9 +173,7 @@ class BagReader(DepthSource):
         _, message = next(self._of(name), (0, None)) if name in self._bag.topics else (0, None)
         return round(1 / message.data, 3) if message is not None and message.data > 0 else None
 
-    def _camera(
-        self, shape: tuple[int, ...], given: tuple[float, ...] | None, time_ns: int
-    ) -> tuple[Camera, str]:
+    def _camera(self, shape: tuple[int, ...], given: tuple[float, ...] | None, time_ns: int) -> tuple[Camera, str]:
         height, width = shape
         if given is not None:
             return Camera(width, height, *given), "as given"

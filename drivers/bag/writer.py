@@ -52,8 +52,7 @@ class BagWriter:
             raise self._failed(error) from error
         kinds = {TOPIC: "sensor_msgs/msg/Image", _CAMERA_TOPIC: "sensor_msgs/msg/CameraInfo"}
         self._topics = {
-            topic: self._writer.add_connection(topic, kind, typestore=self._store)
-            for topic, kind in kinds.items()
+            topic: self._writer.add_connection(topic, kind, typestore=self._store) for topic, kind in kinds.items()
         }
         self._count = 0
 
@@ -68,9 +67,7 @@ class BagWriter:
             If it cannot be written, as on a full disk.
         """
         if frame.timestamp_us < 0:
-            raise ValueError(
-                f"frame {frame.index} has the time {frame.timestamp_us} us; ROS has none before 0"
-            )
+            raise ValueError(f"frame {frame.index} has the time {frame.timestamp_us} us; ROS has none before 0")
         types = self._store.types
         seconds, rest_us = divmod(frame.timestamp_us, 1_000_000)
         stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest_us * 1000)

@@ -127,10 +127,7 @@ def _from_json(path: Path, entries: dict[str, Any]) -> CameraFile:
     width, height = (camera.get(key) or camera.get(key[0]) for key in ("width", "height"))
     scale = camera.get("scale")
     return CameraFile(
-        path,
-        (fx, fy, cx, cy),
-        (int(width), int(height)) if width and height else None,
-        float(scale) if scale else None,
+        path, (fx, fy, cx, cy), (int(width), int(height)) if width and height else None, float(scale) if scale else None
     )
 
 

@@ -60,9 +60,7 @@ def read_raw(path: Path) -> npt.NDArray[Any]:
         raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if raw is None or raw.ndim != 2 or raw.dtype not in (np.uint16, np.float32):
         what = f"{raw.dtype} of shape {raw.shape}" if raw is not None else "damaged or cut off"
-        raise DamagedRecordingError(
-            f"'{path}' is {what}; a depth image is grey, of 16 bits or floating point."
-        )
+        raise DamagedRecordingError(f"'{path}' is {what}; a depth image is grey, of 16 bits or floating point.")
     return raw
 
 
@@ -94,8 +92,7 @@ def read_stack(path: Path) -> npt.NDArray[Any]:
                 loaded = loaded[names[0]]
     except (OSError, ValueError, EOFError, IndexError, KeyError, zipfile.BadZipFile) as error:
         raise DamagedRecordingError(
-            f"'{path}' cannot be read as a NumPy array of depth ({error!s:.120}); write it again"
-            " with numpy.save."
+            f"'{path}' cannot be read as a NumPy array of depth ({error!s:.120}); write it again with numpy.save."
         ) from error
     array: npt.NDArray[Any] = loaded
     if array.ndim == 3 and array.shape[2] == 1:

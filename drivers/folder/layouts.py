@@ -249,9 +249,7 @@ def _images(root: Path, pattern: str, below: Path) -> list[Path]:
     files = [
         path
         for path in found
-        if path.suffix.lower() in SUFFIXES
-        and not path.name.startswith(".")
-        and below in path.absolute().parents
+        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and below in path.absolute().parents
     ]
     first = min((path.parent for path in files), default=root)
     return sorted((path for path in files if path.parent == first), key=lambda path: _natural_key(path.name))

@@ -17,12 +17,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.drivers.errors import (
-    DamagedRecordingError,
-    SourceEndedError,
-    SourceError,
-    SourceTimeoutError,
-)
+from selective_depth.drivers.errors import DamagedRecordingError, SourceEndedError, SourceError, SourceTimeoutError
 from selective_depth.drivers.folder.cameras import CameraFile, find_camera_file
 from selective_depth.drivers.folder.images import read_raw, read_size, read_stack
 from selective_depth.drivers.folder.layouts import ARRAYS, Found, doubtful_order, find_layout
@@ -78,11 +73,7 @@ class RecordedFolder(DepthSource):
     live = False
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        values_per_metre: float | None = None,
-        intrinsics: tuple[float, ...] | None = None,
+        self, path: str | Path, *, values_per_metre: float | None = None, intrinsics: tuple[float, ...] | None = None
     ) -> None:
         self.uri = str(path)
         path = Path(path)
@@ -137,8 +128,7 @@ class RecordedFolder(DepthSource):
         except FutureTimeoutError:
             self._ahead = ahead
             raise SourceTimeoutError(
-                f"'{self._files[self._next]}' was not read within {timeout_s:g} s; is its disk or"
-                " network share there?"
+                f"'{self._files[self._next]}' was not read within {timeout_s:g} s; is its disk or network share there?"
             ) from None
         self._next += 1
         more = self._next < len(self._files)
@@ -172,11 +162,7 @@ class RecordedFolder(DepthSource):
         return height, width
 
     def _camera(
-        self,
-        shape: tuple[int, int],
-        given: tuple[float, ...] | None,
-        sidecar: Camera | None,
-        beside: CameraFile | None,
+        self, shape: tuple[int, int], given: tuple[float, ...] | None, sidecar: Camera | None, beside: CameraFile | None
     ) -> tuple[Camera, str]:
         """The camera, and where it comes from."""
         height, width = shape
@@ -189,8 +175,7 @@ class RecordedFolder(DepthSource):
             if camera := beside.camera(width, height):
                 if beside.varies:
                     self.notes += (
-                        f"'{beside.path}' has other intrinsics for other frames; those of its first"
-                        " are used for all.",
+                        f"'{beside.path}' has other intrinsics for other frames; those of its first are used for all.",
                     )
                 return camera, beside.path.name
             self.notes += (
@@ -289,9 +274,7 @@ def _fps_from(timestamps_us: tuple[int, ...] | None) -> float:
     return round(1e6 / step_us, 3) if 1e3 <= step_us <= 1e9 else _DEFAULT_FPS
 
 
-def _by_table(
-    depth_mm: npt.NDArray[np.float64], marks: Iterable[int]
-) -> Callable[[npt.NDArray[Any]], DepthArray]:
+def _by_table(depth_mm: npt.NDArray[np.float64], marks: Iterable[int]) -> Callable[[npt.NDArray[Any]], DepthArray]:
     """Conversion of 16-bit values by a table of millimetres.
 
     Values beyond 65,535 mm cannot be held and become 0, no measurement.

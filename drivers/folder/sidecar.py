@@ -77,8 +77,7 @@ def read_sidecar(folder: Path) -> Sidecar:
         entries = tomllib.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise DamagedRecordingError(
-            f"'{path}' is no valid TOML ({str(error) or 'nested too deep'}); correct it, or remove"
-            " it to use defaults."
+            f"'{path}' is no valid TOML ({str(error) or 'nested too deep'}); correct it, or remove it to use defaults."
         ) from error
     known = Sidecar.__dataclass_fields__
     for name in entries:
@@ -133,9 +132,7 @@ def read_text(path: Path) -> str:
             )
         return data.decode("utf-8-sig")
     except OSError as error:
-        raise DamagedRecordingError(
-            f"'{path}' cannot be read ({error.strerror}); check its permissions."
-        ) from error
+        raise DamagedRecordingError(f"'{path}' cannot be read ({error.strerror}); check its permissions.") from error
     except UnicodeDecodeError as error:
         raise DamagedRecordingError(
             f"'{path}' is no UTF-8 text (byte {error.start}); correct it, or remove it."
@@ -168,15 +165,11 @@ def _number(path: Path, entries: dict[str, Any], name: str, least: float, most: 
     return float(value)
 
 
-def _integers(
-    path: Path, entries: dict[str, Any], name: str, least: int, most: int
-) -> tuple[int, ...] | None:
+def _integers(path: Path, entries: dict[str, Any], name: str, least: int, most: int) -> tuple[int, ...] | None:
     values = entries.get(name)
     if values is None:
         return None
-    if not isinstance(values, list) or not all(
-        _is_integer(value) and least <= value <= most for value in values
-    ):
+    if not isinstance(values, list) or not all(_is_integer(value) and least <= value <= most for value in values):
         raise _wrong(path, name, values, f"a list of whole numbers from {least} to {most}")
     return tuple(values)
 

@@ -49,9 +49,7 @@ class FolderWriter:
         self._made = not self.path.exists()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            used = any(
-                entry.suffix.lower() == ".png" or entry.name == SIDECAR for entry in self.path.iterdir()
-            )
+            used = any(entry.suffix.lower() == ".png" or entry.name == SIDECAR for entry in self.path.iterdir())
         except OSError as error:
             raise _output_error(self.path, error) from error
         if used:

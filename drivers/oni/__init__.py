@@ -7,13 +7,4 @@ from selective_depth.drivers.oni.repair import export_oni, repair_oni
 from selective_depth.drivers.oni.report import OniReport
 from selective_depth.drivers.oni.writer import OniWriter, write_oni
 
-__all__ = [
-    "OniReader",
-    "OniRecorder",
-    "OniReport",
-    "OniWriter",
-    "export_oni",
-    "inspect_oni",
-    "repair_oni",
-    "write_oni",
-]
+__all__ = ["OniReader", "OniRecorder", "OniReport", "OniWriter", "export_oni", "inspect_oni", "repair_oni", "write_oni"]

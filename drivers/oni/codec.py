@@ -94,8 +94,7 @@ def encode_depth(depth_mm: _Depth) -> bytes:
     table = np.flatnonzero(occurs)
     if len(table) > MAX_DISTINCT:
         raise ValueError(
-            f"a frame holds {len(table)} different depths; an .oni file stores at most"
-            f" {MAX_DISTINCT} in one frame"
+            f"a frame holds {len(table)} different depths; an .oni file stores at most {MAX_DISTINCT} in one frame"
         )
     rank = np.zeros(65536, np.uint16)
     rank[table] = np.arange(len(table), dtype=np.uint16)

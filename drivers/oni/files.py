@@ -34,9 +34,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 def unreadable(path: Path, error: OSError) -> SourceNotFoundError:
     """The error of a file that the system does not let us read."""
-    return SourceNotFoundError(
-        f"'{path}' cannot be read ({error.strerror}); check its name and its permissions."
-    )
+    return SourceNotFoundError(f"'{path}' cannot be read ({error.strerror}); check its name and its permissions.")
 
 
 def skip_hole(file: BinaryIO, offset: int) -> int:
@@ -63,6 +61,5 @@ def read_payload(file: BinaryIO, frame: OniFrame) -> bytes:
         return file.read(frame.payload_size)
     except OSError as error:
         raise DamagedRecordingError(
-            f"'{file.name}' cannot be read at byte {frame.payload_offset} ({error.strerror});"
-            " is its disk in order?"
+            f"'{file.name}' cannot be read at byte {frame.payload_offset} ({error.strerror}); is its disk in order?"
         ) from error

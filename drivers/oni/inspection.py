@@ -16,15 +16,7 @@ from typing import BinaryIO, Final
 
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.oni.files import open_regular, read_payload, skip_hole, unreadable
-from selective_depth.drivers.oni.form import (
-    DepthForm,
-    Sides,
-    depth_form,
-    mended_times,
-    no_depth,
-    turned_at,
-    upright,
-)
+from selective_depth.drivers.oni.form import DepthForm, Sides, depth_form, mended_times, no_depth, turned_at, upright
 from selective_depth.drivers.oni.records import (
     BEGIN_FIELDS,
     CODEC_TABLE,
@@ -57,9 +49,7 @@ _SHAPING: Final = ("xnMapOutputMode", "xnCropping", "oniPixelFormat")
 _SCAN_BYTES: Final = 1 << 20
 
 
-def inspect_oni(
-    path: str | Path, *, decode: bool = False, timeout_s: float = 10.0, stream: int = 1
-) -> OniReport:
+def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10.0, stream: int = 1) -> OniReport:
     """Check an .oni file.
 
     Parameters
@@ -309,9 +299,7 @@ class _Inspection:
             record.offset,
         )
         if record.node > self.highest_node:
-            raise RecordError(
-                f"node {record.node} is beyond the highest that the header states, {self.highest_node}"
-            )
+            raise RecordError(f"node {record.node} is beyond the highest that the header states, {self.highest_node}")
         if addition.node_type in STREAMS and addition.codec not in CODECS:
             raise RecordError(f"the compression {addition.codec!r} is not known")
 
@@ -344,9 +332,7 @@ class _Inspection:
         timestamp_us, number = FRAME_FIELDS.unpack(record.fields)
         last = node.frames[-1] if node.frames else None
         if number != (last.number if last else 0) + 1:
-            self._problem(
-                record.offset, f"frame {number} follows frame {last.number if last else 0} of {node.name}"
-            )
+            self._problem(record.offset, f"frame {number} follows frame {last.number if last else 0} of {node.name}")
             if last is not None and number <= last.number:
                 return
         if timestamp_us > self.latest_us:
@@ -359,9 +345,7 @@ class _Inspection:
         if record.offset != node.seek_table_offset:
             raise RecordError(f"node {node.number} expects it at byte {node.seek_table_offset}")
         if record.payload_size != (len(node.frames) + 1) * form.size:
-            raise RecordError(
-                f"it has {record.payload_size // form.size - 1} entries for {len(node.frames)} frames"
-            )
+            raise RecordError(f"it has {record.payload_size // form.size - 1} entries for {len(node.frames)} frames")
         node.has_seek_table = True
         self.file.seek(record.payload_offset)
         table = self.file.read(record.payload_size)
@@ -369,9 +353,7 @@ class _Inspection:
             raise RecordError("the file became shorter while it was read")
         for frame, entry in zip(node.frames, list(form.iter_unpack(table))[1:], strict=True):
             if (entry[0], entry[2]) != (frame.timestamp_us, frame.record_offset):
-                self._problem(
-                    record.offset, f"the seek table and frame {frame.number} disagree on its place or time"
-                )
+                self._problem(record.offset, f"the seek table and frame {frame.number} disagree on its place or time")
                 return
 
     def _check_counts(self) -> None:
@@ -388,9 +370,7 @@ class _Inspection:
                     harmless=node.seek_table_offset == 0,
                 )
             elif node.declared_frames != there and not node.changed:
-                self._problem(
-                    self.size, f"{node.declared_frames} {node.name} frames are announced, {there} are there"
-                )
+                self._problem(self.size, f"{node.declared_frames} {node.name} frames are announced, {there} are there")
             if node.seek_table_offset and node.declared_frames and not node.has_seek_table:
                 self._problem(
                     self.size, f"there is no sound seek table of {node.name} at byte {node.seek_table_offset}"

@@ -46,9 +46,7 @@ class OniReader(DepthSource):
 
     live = False
 
-    def __init__(
-        self, path: str | Path, *, stream: int = 1, intrinsics: tuple[float, ...] | None = None
-    ) -> None:
+    def __init__(self, path: str | Path, *, stream: int = 1, intrinsics: tuple[float, ...] | None = None) -> None:
         self.uri = str(path)
         self.report = inspect_oni(path, stream=stream)
         self.dropped = 0

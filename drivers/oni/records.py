@@ -69,9 +69,7 @@ class Kind(IntEnum):
     SEEK_TABLE = 0x0E
 
 
-PROPERTIES: Final = frozenset(
-    (Kind.INT_PROPERTY, Kind.REAL_PROPERTY, Kind.STRING_PROPERTY, Kind.GENERAL_PROPERTY)
-)
+PROPERTIES: Final = frozenset((Kind.INT_PROPERTY, Kind.REAL_PROPERTY, Kind.STRING_PROPERTY, Kind.GENERAL_PROPERTY))
 NODE_ADDITIONS: Final = frozenset((Kind.NODE_ADDED_4, Kind.NODE_ADDED_5, Kind.NODE_ADDED))
 
 
@@ -151,9 +149,7 @@ def read_record(file: BinaryIO, offset: int, size: int, old: bool) -> Record:
     return Record(offset, kind, node, fields, payload_offset, payload_size, undone_offset)
 
 
-def pack_record(
-    kind: Kind, node: int, fields: bytes = b"", payload: bytes = b"", undone_offset: int = 0
-) -> bytes:
+def pack_record(kind: Kind, node: int, fields: bytes = b"", payload: bytes = b"", undone_offset: int = 0) -> bytes:
     """Bytes of a record in the current version."""
     fields_end = HEADER.size + len(fields)
     header = HEADER.pack(MAGIC, kind, node, fields_end, len(payload), undone_offset)
@@ -170,11 +166,9 @@ def parse_addition(record: Record, old: bool) -> NodeAddition:
     """
     name, rest = _split_text(record.fields, MAX_NAME)
     form = struct.Struct(
-        {
-            Kind.NODE_ADDED_4: "<I4s",
-            Kind.NODE_ADDED_5: "<I4sIQQ",
-            Kind.NODE_ADDED: "<I4sIQQI" if old else "<I4sIQQQ",
-        }[record.kind]
+        {Kind.NODE_ADDED_4: "<I4s", Kind.NODE_ADDED_5: "<I4sIQQ", Kind.NODE_ADDED: "<I4sIQQI" if old else "<I4sIQQQ"}[
+            record.kind
+        ]
     )
     if len(rest) != form.size:
         raise RecordError(f"its fields after the name have {len(rest)} bytes instead of {form.size}")

@@ -79,11 +79,7 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
 
 
 def export_oni(
-    path: str | Path,
-    folder: str | Path,
-    progress: Callable[[int], None] | None = None,
-    *,
-    frames: int | None = None,
+    path: str | Path, folder: str | Path, progress: Callable[[int], None] | None = None, *, frames: int | None = None
 ) -> OniReport:
     """Save every readable depth frame of an .oni file, damaged or not, as a folder of PNG files.
 
@@ -130,7 +126,5 @@ def _rescuable(path: str | Path) -> OniReport:
     report = inspect_oni(path, decode=True, timeout_s=float("inf"))
     if report.readable_frames == 0 or report.camera is None:
         why = f" ({report.problems[0]})" if report.problems else ""
-        raise DamagedRecordingError(
-            f"nothing can be saved of '{path}': no depth frame in it is readable{why}."
-        )
+        raise DamagedRecordingError(f"nothing can be saved of '{path}': no depth frame in it is readable{why}.")
     return report

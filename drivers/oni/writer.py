@@ -94,9 +94,7 @@ class RecordWriter:
         """Add a stream and what is known of it."""
         self._nodes[number] = addition
         self._entries[number] = []
-        self._node_offsets[number] = self._append(
-            pack_record(Kind.NODE_ADDED, number, pack_addition(addition))
-        )
+        self._node_offsets[number] = self._append(pack_record(Kind.NODE_ADDED, number, pack_addition(addition)))
         for name, (kind, value) in properties.items():
             self._append(pack_record(kind, number, pack_property(name, value)))
         self._append(pack_record(Kind.STATE_READY, number))
@@ -185,8 +183,7 @@ class RecordWriter:
 
     def _failed(self, error: OSError) -> OutputError:
         return OutputError(
-            f"'{self.path}' cannot be written ({error.strerror}); check the folder, its permissions"
-            " and the free space."
+            f"'{self.path}' cannot be written ({error.strerror}); check the folder, its permissions and the free space."
         )
 
 
@@ -250,10 +247,7 @@ class OniWriter:
             )
         if self._codec == CODEC_TABLE and np.unique(frame.depth_mm).size > MAX_DISTINCT:
             self._start_plain()
-        if self._codec == CODEC_TABLE:
-            payload = encode_depth(frame.depth_mm)
-        else:
-            payload = frame.depth_mm.astype("<u2").tobytes()
+        payload = encode_depth(frame.depth_mm) if self._codec == CODEC_TABLE else frame.depth_mm.astype("<u2").tobytes()
         self._writer.add_frame(1, since_us, payload)
 
     def read_back(self) -> DepthArray | None:

@@ -244,10 +244,7 @@ class OpenNIDevice(DepthSource):
         A sensor that is known may have come back under another address.
         """
         worker = Worker(
-            "device",
-            uri=self._wanted_uri,
-            like=asdict(known) if known else None,
-            settings=asdict(self.settings),
+            "device", uri=self._wanted_uri, like=asdict(known) if known else None, settings=asdict(self.settings)
         )
         try:
             deadline = time.monotonic() + timeout_s

@@ -76,6 +76,4 @@ def _usual_folders(system: str) -> list[Path]:
     if system == "darwin":
         return [Path(root, "lib", sub) for root in ("/opt/homebrew", "/usr/local") for sub in ("ni2", "")]
     multiarch = f"{platform.machine()}-linux-gnu"
-    return [
-        Path(root, sub) for root in ("/usr/local", "/usr") for sub in (f"lib/{multiarch}", "lib", "lib64")
-    ]
+    return [Path(root, sub) for root in ("/usr/local", "/usr") for sub in (f"lib/{multiarch}", "lib", "lib64")]

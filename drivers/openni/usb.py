@@ -49,9 +49,7 @@ def usb_advice(
         driver, remedy = _DRIVERS[name]
         if not any(driver.lower() in one.lower() for one in drivers):
             having = ", ".join(sorted(drivers)) or "none"
-            return (
-                f"A {name} is on the USB bus, but OpenNI2 has no driver for it (it has: {having}): {remedy}."
-            )
+            return f"A {name} is on the USB bus, but OpenNI2 has no driver for it (it has: {having}): {remedy}."
         if not os.access(found[number], os.R_OK | os.W_OK):
             return (
                 f"A {name} is on the USB bus, but you may not use it ({found[number]}): install"

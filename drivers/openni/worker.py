@@ -110,9 +110,7 @@ def choose(found: list[dict[str, Any]], wanted: str, like: dict[str, Any] | None
         raise JobError("SourceNotFoundError", f"There is no sensor '{wanted}'. Connected: {uris}.")
     if not found:
         raise JobError(
-            "SourceNotFoundError",
-            "OpenNI2 finds no depth sensor.",
-            "Plug one in; a Kinect needs its power supply too.",
+            "SourceNotFoundError", "OpenNI2 finds no depth sensor.", "Plug one in; a Kinect needs its power supply too."
         )
     if len(found) > 1:
         raise JobError(
@@ -173,8 +171,7 @@ class LiveStream:
         except OpenNIError as error:
             raise JobError(
                 "DeviceRefusedError",
-                f"The sensor {uri} refuses a depth stream: {reason(error)}. Pull it out and plug"
-                " it in again.",
+                f"The sensor {uri} refuses a depth stream: {reason(error)}. Pull it out and plug it in again.",
             ) from error
 
     def _configure(self, settings: dict[str, Any]) -> None:
@@ -209,8 +206,7 @@ class LiveStream:
                 device.set_image_registration_mode(mode)
         elif wanted:
             raise JobError(
-                "DeviceRefusedError",
-                f"The sensor {self.info['uri']} cannot register depth to its colour camera.",
+                "DeviceRefusedError", f"The sensor {self.info['uri']} cannot register depth to its colour camera."
             )
 
     def start(self) -> None:
@@ -261,9 +257,7 @@ def misfit(frame: Any, width: int, height: int) -> str:
     expected = (width, height, width * 2, width * height * 2)
     got = (frame.width, frame.height, frame.stride, frame.dataSize)
     if got != expected:
-        return "it is {}x{} (stride {}, {} bytes), expected {}x{} (stride {}, {} bytes)".format(
-            *got, *expected
-        )
+        return "it is {}x{} (stride {}, {} bytes), expected {}x{} (stride {}, {} bytes)".format(*got, *expected)
     if int(frame.videoMode.pixelFormat) != MILLIMETRES:
         return f"it is {mode_text(frame.videoMode)}, expected depth in mm"
     return ""
@@ -274,9 +268,7 @@ def run_list(job: dict[str, Any], parent: Parent) -> None:
     initialize(job)
     version = openni2.get_version()
     parent.send(
-        "devices",
-        devices=devices(),
-        version=f"{version.major}.{version.minor}.{version.maintenance}.{version.build}",
+        "devices", devices=devices(), version=f"{version.major}.{version.minor}.{version.maintenance}.{version.build}"
     )
 
 

@@ -98,9 +98,7 @@ def read_ply(path: Path) -> Mesh:
     except _NoPlyError:
         raise SourceNotFoundError(f"'{path}' is no PLY file: it does not begin with the line 'ply'") from None
     except _BadPlyError as error:
-        raise DamagedRecordingError(
-            f"'{path}' cannot be read: {error}. Export the object again as PLY."
-        ) from error
+        raise DamagedRecordingError(f"'{path}' cannot be read: {error}. Export the object again as PLY.") from error
 
 
 class _NoPlyError(Exception):
@@ -154,9 +152,7 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
                 elements.append(_Element(name, int(rows)))
             case ["property", scalar, name] if scalar in _SCALARS and elements:
                 elements[-1].properties.append(_Property(name, _SCALARS[scalar]))
-            case ["property", "list", count, scalar, name] if (
-                count in _SCALARS and scalar in _SCALARS and elements
-            ):
+            case ["property", "list", count, scalar, name] if count in _SCALARS and scalar in _SCALARS and elements:
                 if _SCALARS[count] in "fd":
                     raise _BadPlyError(f"its header gives a list length as {count}: '{line}'")
                 elements[-1].properties.append(_Property(name, _SCALARS[scalar], _SCALARS[count]))
@@ -268,8 +264,7 @@ def _mesh(columns: _Columns) -> Mesh:
     wrong = items[~((items >= 0) & (items < len(points)) & (items == np.floor(items)))]
     if len(wrong):
         raise _BadPlyError(
-            f"a face names vertex {wrong[0]:g}; there are {len(points)} vertices, counted from 0"
-            " in whole numbers"
+            f"a face names vertex {wrong[0]:g}; there are {len(points)} vertices, counted from 0 in whole numbers"
         )
     return Mesh(points, _fans(faces.lengths, items.astype(np.int32)))
 
@@ -279,6 +274,4 @@ def _fans(lengths: npt.NDArray[np.int64], corners: npt.NDArray[np.int32]) -> npt
     counts = np.maximum(lengths - 2, 0)
     first = np.repeat(np.cumsum(lengths) - lengths, counts)
     step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    return np.stack((corners[first], corners[first + step + 1], corners[first + step + 2]), axis=1).astype(
-        np.int32
-    )
+    return np.stack((corners[first], corners[first + step + 1], corners[first + step + 2]), axis=1).astype(np.int32)

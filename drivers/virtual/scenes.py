@@ -87,9 +87,7 @@ class Builder:
     ) -> None:
         self._rows.append((kind, int(material), centre, first, second, size))
 
-    def quad(
-        self, material: Material, centre: Vector, first: Vector, second: Vector, w: float, h: float
-    ) -> None:
+    def quad(self, material: Material, centre: Vector, first: Vector, second: Vector, w: float, h: float) -> None:
         """A rectangle `w` by `h` along `first` and `second`, seen from their cross product."""
         self._add(QUAD, material, centre, first, second, (w / 2, h / 2))
 
@@ -101,9 +99,7 @@ class Builder:
             for sign in (1.0, -1.0):
                 middle = np.array(centre) + sign * size[k] / 2 * turn[:, k]
                 first, second = turn[:, one], sign * turn[:, two]
-                self.quad(
-                    material, vector_of(middle), vector_of(first), vector_of(second), size[one], size[two]
-                )
+                self.quad(material, vector_of(middle), vector_of(first), vector_of(second), size[one], size[two])
 
     def sphere(self, material: Material, centre: Vector, radius: float) -> None:
         """A ball."""
@@ -329,20 +325,14 @@ def fire_hose() -> Scene:
     # An extinguisher in front, and a rail nearer to the camera.
     b.rod(Material.PAINT, (700, floor - 90, 1800), (700, floor - 480, 1800), 82, "round")
     b.rod(Material.BLACK, (700, floor - 560, 1800), (700, floor - 640, 1800), 26)
-    b.chain(
-        Material.BLACK, [(720, floor - 610, 1790), (800, floor - 560, 1770), (815, floor - 380, 1770)], 13
-    )
+    b.chain(Material.BLACK, [(720, floor - 610, 1790), (800, floor - 560, 1770), (815, floor - 380, 1770)], 13)
     b.rod(Material.METAL, (-900, 560, 1320), (-420, 585, 1290), 24, "round")
     for x, z in ((-840.0, 1316.0), (-470.0, 1293.0)):
         b.rod(Material.METAL, (x, 570, z), (x, floor, z), 20, "open")
     return Scene(b.shapes(), np.array((40, 90, 2000.0)), np.array((340, 150, 200.0)))
 
 
-SCENES: dict[str, Callable[[], Scene]] = {
-    "workstation": workstation,
-    "ball": exercise_ball,
-    "firehose": fire_hose,
-}
+SCENES: dict[str, Callable[[], Scene]] = {"workstation": workstation, "ball": exercise_ball, "firehose": fire_hose}
 """The scenes by name."""
 
 ALIASES = {"exercise-ball": "ball", "fire-hose": "firehose"}

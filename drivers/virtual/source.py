@@ -155,9 +155,7 @@ class VirtualSource(DepthSource):
         self._next = max(newest, self._next)
 
 
-def camera_pose(
-    scene: Scene, time_s: float, seed: int
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def camera_pose(scene: Scene, time_s: float, seed: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Where a hand holds the camera: an endless smooth path round the scene's target.
 
     Parameters

@@ -4,12 +4,4 @@ from selective_depth.selectors.acquire.loop import MOST_ROUNDS, Acquisition, acq
 from selective_depth.selectors.acquire.step import StepSelector
 from selective_depth.selectors.acquire.surface import SurfaceSelector
 
-__all__ = [
-    "MOST_ROUNDS",
-    "Acquisition",
-    "StepSelector",
-    "SurfaceSelector",
-    "acquire",
-    "best_selector",
-    "shots_of",
-]
+__all__ = ["MOST_ROUNDS", "Acquisition", "StepSelector", "SurfaceSelector", "acquire", "best_selector", "shots_of"]

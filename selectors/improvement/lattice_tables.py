@@ -140,9 +140,7 @@ def build_tables(geometries: list[tuple[int, int, int, int]], exponent: float) -
     )
 
 
-def _tabulate(
-    up: int, down: int, left: int, right: int, exponent: float
-) -> dict[str, npt.NDArray[np.generic]]:
+def _tabulate(up: int, down: int, left: int, right: int, exponent: float) -> dict[str, npt.NDArray[np.generic]]:
     half = exponent / 2
     v, u = (axis.ravel() for axis in np.meshgrid((-up, 0, down), (-left, 0, right), indexing="ij"))
     H = ((u[:, None] - u) ** 2.0 + (v[:, None] - v) ** 2.0) ** half

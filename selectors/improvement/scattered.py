@@ -16,13 +16,7 @@ import numpy.typing as npt
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import checked_map, sample_pairs
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_over
-from selective_depth.selectors.improvement.systems import (
-    MAX_SAMPLES,
-    Box,
-    krige_window,
-    sample_buffers,
-    window_scratch,
-)
+from selective_depth.selectors.improvement.systems import MAX_SAMPLES, Box, krige_window, sample_buffers, window_scratch
 from selective_depth.selectors.improvement.variogram import fit_samples
 from selective_depth.selectors.parallel import in_bands
 

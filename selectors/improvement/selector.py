@@ -19,12 +19,7 @@ from selective_depth.selectors.choice import choose
 from selective_depth.selectors.improvement.lattice import lattice_scratch
 from selective_depth.selectors.improvement.map import LEVEL_SHIFT, LEVELS, best_threshold, improvement_rows
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_of
-from selective_depth.selectors.improvement.scattered import (
-    EXPONENT,
-    MOST_EXPONENT,
-    ImprovementMap,
-    map_scattered,
-)
+from selective_depth.selectors.improvement.scattered import EXPONENT, MOST_EXPONENT, ImprovementMap, map_scattered
 from selective_depth.selectors.improvement.systems import aligned_zeros, sample_buffers, window_scratch
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import Samples
@@ -90,12 +85,7 @@ class ImprovementSelector:
     name = "improvement"
 
     def __init__(
-        self,
-        share: float = 0.10,
-        exponent: float = EXPONENT,
-        threads: int | None = None,
-        *,
-        by_sums: bool = False,
+        self, share: float = 0.10, exponent: float = EXPONENT, threads: int | None = None, *, by_sums: bool = False
     ) -> None:
         if not 0 <= share <= 1:
             raise ValueError(f"share is {share}; it is a part of all pixels, 0..1")

@@ -82,9 +82,7 @@ def local_systems(seeds: SeedGrid, u: int, v: int, exponent: float = EXPONENT) -
             a, b = fit_samples(depth, np.arange(count), count, between)
             found.append((share_down * share_across * count, a, b, uv, depth))
     total = sum(weight for weight, *_ in found)
-    return [
-        LocalSystem(weight / total, a, b, uv, depth, neighbours[inside]) for weight, a, b, uv, depth in found
-    ]
+    return [LocalSystem(weight / total, a, b, uv, depth, neighbours[inside]) for weight, a, b, uv, depth in found]
 
 
 def _centres(axis: Axis, pixel: int) -> list[tuple[int, float]]:

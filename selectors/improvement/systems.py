@@ -313,12 +313,7 @@ def _add_rows(block, factors, total, pixels):  # type: ignore[no-untyped-def]
     f0, f1 = np.float32(factors[0]), np.float32(factors[1])
     f2, f3 = np.float32(factors[2]), np.float32(factors[3])
     for p in range(pixels):
-        total[p] += (
-            f0 * block[p]
-            + f1 * block[_STRIDE + p]
-            + f2 * block[2 * _STRIDE + p]
-            + f3 * block[3 * _STRIDE + p]
-        )
+        total[p] += f0 * block[p] + f1 * block[_STRIDE + p] + f2 * block[2 * _STRIDE + p] + f3 * block[3 * _STRIDE + p]
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -397,8 +392,6 @@ def _improve_by_sums(samples, a, b, box, scratch):  # type: ignore[no-untyped-de
             total = left + right + above + under + inverse[p]  # sum of 1 / z(j)
             first_moments = d_u * (right - left) + d_v * (under - above)
             second_moments = d_u * d_u * (right + left) + d_v * d_v * (under + above)
-            bracket = beyond * beyond * total + np.float32(4) * a * (
-                beyond * first_moments + a * second_moments
-            )
+            bracket = beyond * beyond * total + np.float32(4) * a * (beyond * first_moments + a * second_moments)
             own = (np.float32(2) * b * variance[p] - b * b) * inverse[p]
             improvement[p] = (bracket + own) / max(variance[p], np.float32(1e-30))

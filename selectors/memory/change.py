@@ -46,9 +46,7 @@ def contradicts(uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Flo
 
 
 @njit(cache=True, nogil=True)
-def _contradict(
-    uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Float32Array, against: BoolArray
-) -> None:
+def _contradict(uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Float32Array, against: BoolArray) -> None:
     height, width = model_mm.shape
     for i in range(len(uv)):
         u, v, z = uv[i, 0], uv[i, 1], depth_mm[i]
@@ -63,9 +61,7 @@ def _contradict(
         against[i] = z < low - tolerance or z > high + tolerance
 
 
-def drift(
-    uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Float32Array, noise_mm: Float32Array
-) -> float:
+def drift(uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Float32Array, noise_mm: Float32Array) -> float:
     """How many standard errors the mean of a block's look-outs is off, median over the blocks.
 
     Parameters

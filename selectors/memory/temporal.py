@@ -17,15 +17,7 @@ from scipy.ndimage import maximum_filter
 from selective_depth.drivers.frame import Camera
 from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.choice import choose
-from selective_depth.selectors.memory.change import (
-    MARGIN_PX,
-    MOVED,
-    NEAR_PX,
-    Extent,
-    around,
-    contradicts,
-    drift,
-)
+from selective_depth.selectors.memory.change import MARGIN_PX, MOVED, NEAR_PX, Extent, around, contradicts, drift
 from selective_depth.selectors.memory.store import Memory, book, forget
 from selective_depth.selectors.memory.worth import WRONG, Noise, shot_worth
 from selective_depth.selectors.parallel import in_bands
@@ -254,9 +246,7 @@ class TemporalAcquisition:
             frame=self._frame,
             uv=np.concatenate(sensor.uv),
             depth_mm=np.concatenate(sensor.depth_mm),
-            batch=np.repeat(
-                np.minimum(np.arange(len(sensor.uv)), 255).astype(np.uint8), [len(uv) for uv in sensor.uv]
-            ),
+            batch=np.repeat(np.minimum(np.arange(len(sensor.uv)), 255).astype(np.uint8), [len(uv) for uv in sensor.uv]),
             model_mm=model_mm,
             known_mm=self._memory.fused_mm.copy(),
             seeds=self._seeds(),

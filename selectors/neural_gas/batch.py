@@ -105,10 +105,7 @@ class BatchNeuralGas:
         return self
 
     def adopt(
-        self,
-        nodes_mm: npt.NDArray[np.float32],
-        nodes_uv: npt.NDArray[np.float32],
-        points_mm: npt.NDArray[np.float32],
+        self, nodes_mm: npt.NDArray[np.float32], nodes_uv: npt.NDArray[np.float32], points_mm: npt.NDArray[np.float32]
     ) -> Self:
         """Take over nodes trained otherwise, to go on from them.
 
@@ -129,11 +126,7 @@ class BatchNeuralGas:
         return self
 
     def _pass(
-        self,
-        points: npt.NDArray[np.float32],
-        pixels: npt.NDArray[np.int32],
-        passes: int,
-        most: float = math.inf,
+        self, points: npt.NDArray[np.float32], pixels: npt.NDArray[np.int32], passes: int, most: float = math.inf
     ) -> None:
         """Take batch passes; as many as from nothing if the error at first is above `most`."""
         uv = pixels.astype(np.float32)
@@ -150,11 +143,7 @@ class BatchNeuralGas:
         done = 0
         while True:
             bins = _sort_into_bins(self.nodes_mm_, self.nodes_uv_, bin_px, rows, columns)
-            in_bands(
-                partial(find, points, uv, bin_px, rows, columns, *bins, winner, d2),
-                len(points),
-                self._threads,
-            )
+            in_bands(partial(find, points, uv, bin_px, rows, columns, *bins, winner, d2), len(points), self._threads)
             if done == 0:
                 self.reheated_ = _mean_distance(d2[0]) > most
                 passes = COLD_PASSES if self.reheated_ else passes

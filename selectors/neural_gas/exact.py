@@ -23,9 +23,7 @@ _SLACK = 1.2  # how much farther than expected the nodes that move are looked fo
 _FAR = 1e18  # where the padding of the last groups lies: its square is still finite
 
 
-def draw_nodes(
-    points_mm: npt.NDArray[np.float32], nodes: int, rng: np.random.Generator
-) -> npt.NDArray[np.float32]:
+def draw_nodes(points_mm: npt.NDArray[np.float32], nodes: int, rng: np.random.Generator) -> npt.NDArray[np.float32]:
     """Draw the first nodes from the points, without replacement as long as they last.
 
     Returns
@@ -38,9 +36,7 @@ def draw_nodes(
     return points_mm[np.concatenate((np.arange(count), rng.integers(0, count, nodes - count)))]
 
 
-def train_exact(
-    points_mm: npt.NDArray[np.float32], nodes: int, epochs: int, seed: int
-) -> npt.NDArray[np.float32]:
+def train_exact(points_mm: npt.NDArray[np.float32], nodes: int, epochs: int, seed: int) -> npt.NDArray[np.float32]:
     """Train neural gas from nothing with the published steps.
 
     Samples are drawn with replacement, ``epochs * len(points_mm)`` of them, and each moves the
@@ -95,11 +91,7 @@ def anneal(
     padded = np.full((3, _MEMBERS * groups), _FAR)
     padded[:, :count] = nodes_mm.T
     settled: npt.NDArray[np.float32] = _anneal(
-        points_mm.astype(np.float64),
-        padded.reshape(3, _MEMBERS, groups),
-        count,
-        draws,
-        max(count / 2, LAMBDA_LAST),
+        points_mm.astype(np.float64), padded.reshape(3, _MEMBERS, groups), count, draws, max(count / 2, LAMBDA_LAST)
     )
     return settled
 

@@ -161,12 +161,7 @@ def delaunay_regions(
     state = np.zeros(frame_shape, dtype=np.uint8)
     worth = np.where(kept, 1 - longest / max(threshold, 1e-30), 0).astype(np.float32)
     _rasterise(
-        drawn_uv.astype(np.float64),
-        triangles,
-        np.where(kept, _KEPT, _LONG).astype(np.uint8),
-        worth,
-        state,
-        score,
+        drawn_uv.astype(np.float64), triangles, np.where(kept, _KEPT, _LONG).astype(np.uint8), worth, state, score
     )
     return RegionSelection(
         mask=state == _KEPT,

@@ -139,8 +139,7 @@ class NeuralGasSelector:
             return self._nothing(samples)
         if not self._updating.acquire(blocking=False):
             raise RuntimeError(
-                "another thread is updating this NeuralGasSelector; give each stream of frames a"
-                " selector of its own"
+                "another thread is updating this NeuralGasSelector; give each stream of frames a selector of its own"
             )
         try:
             gas = self._live.update(points, uv)

@@ -313,16 +313,7 @@ class Mesh:
         end = self.points + len(uv)
         self.uv[self.points : end] = uv
         self.triangles = _insert_all(
-            self.uv,
-            self.points,
-            end,
-            -1,
-            self.tri,
-            self.adj,
-            self.triangles,
-            self.bins,
-            self.bin_px,
-            self.changed,
+            self.uv, self.points, end, -1, self.tri, self.adj, self.triangles, self.bins, self.bin_px, self.changed
         )
         self.points = end
 

@@ -110,7 +110,5 @@ def nearest_sample(
     nearest_row = np.empty((height, width), np.int32)
     nearest, gap_sq = np.empty((height, width), np.int32), np.empty((height, width), np.int32)
     in_bands(lambda first, end: _nearest_row_in_column(valid, nearest_row, first, end), width, threads)
-    in_bands(
-        lambda first, end: _nearest_along_rows(nearest_row, nearest, gap_sq, first, end), height, threads
-    )
+    in_bands(lambda first, end: _nearest_along_rows(nearest_row, nearest, gap_sq, first, end), height, threads)
     return nearest, gap_sq

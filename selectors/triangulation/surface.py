@@ -120,9 +120,7 @@ def _claim(layers: Layers, uv: Int32Array) -> None:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _bridges(
-    uv: Int32Array, z_mm: Float32Array, corners: Int32Array, step_mm: float, bridge_px: float
-) -> bool:
+def _bridges(uv: Int32Array, z_mm: Float32Array, corners: Int32Array, step_mm: float, bridge_px: float) -> bool:
     """Whether a triangle of three points spans a hole or a depth step."""
     a, b, c = corners[0], corners[1], corners[2]
     if max(z_mm[a], z_mm[b], z_mm[c]) - min(z_mm[a], z_mm[b], z_mm[c]) <= step_mm:
@@ -136,9 +134,7 @@ def _bridges(
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def _along_edge(
-    uv: Int32Array, z_mm: Float32Array, corners: Int32Array, across: int, u: int, v: int
-) -> np.float32:
+def _along_edge(uv: Int32Array, z_mm: Float32Array, corners: Int32Array, across: int, u: int, v: int) -> np.float32:
     """Depth at a pixel of the edge across from a corner: to the last bit, either triangle's."""
     a, b = corners[(across + 1) % 3], corners[(across + 2) % 3]
     if a > b:
@@ -222,9 +218,7 @@ def _draw(
 
 
 @njit(cache=True, nogil=True)
-def _mark_stars(
-    tri: Int32Array, adj: Int32Array, other: npt.NDArray[np.bool_], changed: npt.NDArray[np.bool_]
-) -> None:
+def _mark_stars(tri: Int32Array, adj: Int32Array, other: npt.NDArray[np.bool_], changed: npt.NDArray[np.bool_]) -> None:
     """Mark the triangles of points whose depth is another now, and those that share an edge."""
     for t in range(len(tri)):
         for k in range(3):

@@ -65,9 +65,7 @@ def start(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
 
 
 def depth_rows(path: Path) -> int:
-    return sum(
-        chunk.num_rows for chunk in RrdReader(str(path)).stream() if chunk.entity_path == "/camera/depth"
-    )
+    return sum(chunk.num_rows for chunk in RrdReader(str(path)).stream() if chunk.entity_path == "/camera/depth")
 
 
 # Help
@@ -175,9 +173,7 @@ def test_completion_knows_the_commands(shell: str, capsys: pytest.CaptureFixture
         (["record", "x.oni", "--frames", "-1"], "--frames is -1"),
     ],
 )
-def test_wrong_usage_is_one_line(
-    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_usage_is_one_line(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, line = refuse(capsys, *arguments)
     assert code == 2
     assert words in line
@@ -328,9 +324,7 @@ def test_text_named_oni(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> N
     refuse(capsys, "replay", str(tmp_path / "notes.oni"), *QUICK)
 
 
-def test_no_runtime(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_runtime(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENNI2_REDIST", str(tmp_path))
     for command in (["live"], ["devices"], ["record", str(tmp_path / "x.oni")]):
         _, line = refuse(capsys, *command)
@@ -439,9 +433,7 @@ def test_a_worker_that_is_just_being_started_ends_without_a_word(tmp_path: Path)
         timeout=30,
     )
     assert done.returncode == 130
-    assert [line for line in done.stderr.splitlines() if "frames" not in line] == [
-        "selective-depth: interrupted."
-    ]
+    assert [line for line in done.stderr.splitlines() if "frames" not in line] == ["selective-depth: interrupted."]
 
 
 def test_interrupted_before_it_has_read_its_command_line() -> None:
@@ -451,9 +443,7 @@ def test_interrupted_before_it_has_read_its_command_line() -> None:
         " os.kill(os.getpid(), signal.SIGINT) if name == 'tyro' else None)});"
         "sys.meta_path.insert(0, find); main()"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program, "devices"], capture_output=True, text=True, timeout=30
-    )
+    done = subprocess.run([sys.executable, "-c", program, "devices"], capture_output=True, text=True, timeout=30)
     assert (done.returncode, done.stderr) == (130, "selective-depth: interrupted.\n")
 
 
@@ -487,9 +477,7 @@ def test_selector_options_out_of_range(capsys: pytest.CaptureFixture[str]) -> No
     assert "-5" in line
 
 
-def test_unexpected_error_asks_for_debug(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unexpected_error_asks_for_debug(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> int:
         raise KeyError("surprise")
 
@@ -533,9 +521,7 @@ def test_real_sequence_is_saved_whole(shared_data: Path, tmp_path: Path) -> None
         np.testing.assert_array_equal(found[frame].reshape(depth_mm.shape), depth_mm)
 
 
-def interrupt(
-    out: Path, arguments: list[str], after_s: float | None, number: int = signal.SIGINT
-) -> tuple[str, str]:
+def interrupt(out: Path, arguments: list[str], after_s: float | None, number: int = signal.SIGINT) -> tuple[str, str]:
     """Stop an endless command after a time, or once it has saved something; return its output."""
     process = start(*arguments, cwd=out.parent)
     deadline_s = time.monotonic() + (120 if after_s is None else after_s)

@@ -28,9 +28,7 @@ def can_mount() -> bool:
     return bool(shutil.which("unshare")) and not subprocess.run(trial, capture_output=True).returncode
 
 
-pytestmark = pytest.mark.skipif(
-    not can_mount(), reason="mounting a small disk takes Linux with user namespaces"
-)
+pytestmark = pytest.mark.skipif(not can_mount(), reason="mounting a small disk takes Linux with user namespaces")
 
 
 class Disk:
@@ -42,10 +40,7 @@ class Disk:
         # The shell stays after the command, and the disk with it, until its input ends.
         script = f'{mount}; "$@" 2>&1; echo "exit code $?"; read end'
         self.process = subprocess.Popen(
-            [*ALONE, "sh", "-c", script, "sh", *command],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
+            [*ALONE, "sh", "-c", script, "sh", *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         self.folder = Path(f"/proc/{self.process.pid}/root{folder}")
 
@@ -70,8 +65,7 @@ def disk(folder: Path, options: str, *arguments: str) -> Iterator[Disk]:
 
 
 @pytest.mark.parametrize(
-    ("options", "reason"),
-    [("size=1m", "1 MiB are free there"), ("ro", "cannot be written: Read-only file system")],
+    ("options", "reason"), [("size=1m", "1 MiB are free there"), ("ro", "cannot be written: Read-only file system")]
 )
 def test_a_disk_without_room_is_refused_at_once(tmp_path: Path, options: str, reason: str) -> None:
     saving = ("replay", ENDLESS, "--save", str(tmp_path / "out.rrd"))

@@ -152,9 +152,7 @@ def test_the_oracle_shoots_at_maxima_before_what_lies_beside_them() -> None:
     assert {tuple(uv) for uv in shots[:2]} == {(u + 2, v + 1), (far_u + 1, far_v + 1)}
 
 
-@pytest.mark.parametrize(
-    "name", [n for n in STRATEGIES if "loop" not in n and "uniform" not in n and n != "oracle"]
-)
+@pytest.mark.parametrize("name", [n for n in STRATEGIES if "loop" not in n and "uniform" not in n and n != "oracle"])
 def test_one_shot_goes_no_farther_than_is_worth_it(name: str) -> None:
     """1.3 steps of 5 px from a seed with depth; a hole of 70x70 pixels is mostly beyond."""
     depth = frame().depth_mm.copy()
@@ -375,12 +373,8 @@ def test_the_picture_shows_shots_and_errors(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("budget", "said"), [("0.005", "+0.5%"), ("0.025", "+2.5%"), ("0.05", "+5%"), ("0.10", "+10%")]
 )
-def test_a_budget_is_said_as_it_was_asked_for(
-    budget: str, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    figures = dict.fromkeys(
-        ("geo", "worst", "share", "share_min", "rmse_mm", "mae_mm", "wrong", "missed"), 0.5
-    )
+def test_a_budget_is_said_as_it_was_asked_for(budget: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    figures = dict.fromkeys(("geo", "worst", "share", "share_min", "rmse_mm", "mae_mm", "wrong", "missed"), 0.5)
     print_results({budget: {"loop": figures}}, frames=3, rounds=2)
     assert f"{said} of the pixels" in capsys.readouterr().out
 

@@ -25,11 +25,7 @@ def recording(tmp_path: Path) -> Path:
     path = tmp_path / "walk.oni"
     camera = Camera.kinect(64, 48)
     write_oni(
-        path,
-        (
-            DepthFrame(draw.integers(0, 4000, (48, 64), np.uint16), number, number, camera)
-            for number in range(5)
-        ),
+        path, (DepthFrame(draw.integers(0, 4000, (48, 64), np.uint16), number, number, camera) for number in range(5))
     )
     return path
 
@@ -48,9 +44,7 @@ def test_check_of_a_whole_file(recording: Path, capsys: pytest.CaptureFixture[st
         assert any(all(part in line for part in row) for line in printed.splitlines()), row
 
 
-def test_check_of_a_cut_file_says_where_and_what_next(
-    recording: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_of_a_cut_file_says_where_and_what_next(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cut = _cut(recording)
     assert run(["check", str(cut)]) == 1
     printed = capsys.readouterr().out
@@ -90,9 +84,7 @@ def test_a_source_without_end_needs_a_number(
 
 
 @pytest.mark.parametrize("content", ["", "text named .oni"])
-def test_check_of_what_is_no_recording(
-    tmp_path: Path, content: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_of_what_is_no_recording(tmp_path: Path, content: str, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "not.oni"
     path.write_text(content)
     assert run(["check", str(path)]) == 1
@@ -121,9 +113,7 @@ def test_export_to_a_folder_and_back(recording: Path) -> None:
         assert one.camera == two.camera
 
 
-def test_export_saves_what_is_readable_of_a_damaged_file(
-    recording: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_saves_what_is_readable_of_a_damaged_file(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for out in ("frames", "out.oni"):
         assert run(["export", str(_cut(recording)), str(recording.with_name(out))]) == 0
         assert "2 frames" in capsys.readouterr().out
@@ -185,9 +175,7 @@ def test_a_principal_point_that_is_lost_is_told(tmp_path: Path, capsys: pytest.C
     assert "principal point" not in capsys.readouterr().out
 
 
-def test_options_of_a_source_are_given_on_the_command_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_of_a_source_are_given_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for number in range(2):
         (tmp_path / "in" / "depth").mkdir(parents=True, exist_ok=True)
         write_png(tmp_path / "in" / "depth" / f"{number}.png", np.full((48, 64), 1500, np.uint16))

@@ -16,14 +16,7 @@ import numpy as np
 import pytest
 
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.output import (
-    IMAGES,
-    check_output,
-    check_picture,
-    replacing,
-    write_image,
-    write_output,
-)
+from selective_depth.app.console.output import IMAGES, check_output, check_picture, replacing, write_image, write_output
 from selective_depth.drivers.errors import OutputError
 
 IMAGE = np.tile(np.arange(48, dtype=np.uint8)[:, None, None], (1, 64, 3))

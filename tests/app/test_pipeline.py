@@ -20,14 +20,7 @@ from selective_depth.app.commands.run import Session
 from selective_depth.app.console import interrupt
 from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes, timing
 from selective_depth.app.pipeline.pipeline import MODEL_EVERY, Pipeline
-from selective_depth.app.settings import (
-    AcquireOptions,
-    GasOptions,
-    RunOptions,
-    SeedOptions,
-    Settings,
-    ViewerOptions,
-)
+from selective_depth.app.settings import AcquireOptions, GasOptions, RunOptions, SeedOptions, Settings, ViewerOptions
 from selective_depth.app.viewer import Viewer
 from selective_depth.drivers.errors import (
     DamagedRecordingError,
@@ -77,9 +70,7 @@ class Script(DepthSource):
         self.closed += 1
 
 
-def run(
-    monkeypatch: pytest.MonkeyPatch, source: DepthSource, settings: Settings = SMALL
-) -> tuple[int, Session]:
+def run(monkeypatch: pytest.MonkeyPatch, source: DepthSource, settings: Settings = SMALL) -> tuple[int, Session]:
     monkeypatch.setattr(session_module, "open_source", lambda uri: source)
     session = Session("script", settings)
     return session.run(), session
@@ -232,9 +223,7 @@ def test_a_step_has_the_times_of_its_own_frame(monkeypatch: pytest.MonkeyPatch) 
         pipeline.warm_up(make_frame(0))
         select, calls = pipeline._improvement.select, itertools.count()
         monkeypatch.setattr(
-            pipeline._improvement,
-            "select",
-            lambda seeds: (time.sleep(0.3 * (next(calls) == 3)), select(seeds))[1],
+            pipeline._improvement, "select", lambda seeds: (time.sleep(0.3 * (next(calls) == 3)), select(seeds))[1]
         )
         steps = []
         for index in range(6):
@@ -314,9 +303,7 @@ def test_source_is_closed_when_a_selector_fails(monkeypatch: pytest.MonkeyPatch)
     assert source.closed == 1
 
 
-def test_saved_run_writes_settings_and_picture_beside(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_saved_run_writes_settings_and_picture_beside(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     viewer = ViewerOptions(headless=True, save=tmp_path / "run.rrd")
     code, session = run(monkeypatch, Script([0, 1]), dataclasses.replace(SMALL, viewer=viewer))
     assert code == 0

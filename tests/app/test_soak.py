@@ -111,11 +111,7 @@ LENGTHS = [200, pytest.param(FRAMES, marks=pytest.mark.slow)]
 @pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
 @pytest.mark.parametrize("count", LENGTHS)
 def test_a_sensor_can_be_watched_for_long(
-    count: int,
-    desk_mm: npt.NDArray[np.uint16],
-    virtual_driver: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    count: int, desk_mm: npt.NDArray[np.uint16], virtual_driver: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sensor = VirtualSensor(tmp_path / "sensor", desk_mm, devices=2)
     for name, value in sensor.env.items():
@@ -130,9 +126,7 @@ def test_a_long_recording_can_be_replayed(
     count: int, desk_mm: npt.NDArray[np.uint16], virtual_driver: Path, tmp_path: Path
 ) -> None:
     camera = Camera.kinect()
-    frames = (
-        DepthFrame(desk_mm[index % len(desk_mm)], index, index * 33_333, camera) for index in range(count)
-    )
+    frames = (DepthFrame(desk_mm[index % len(desk_mm)], index, index * 33_333, camera) for index in range(count))
     write_oni(tmp_path / "long.oni", frames)
     check(count, (str(tmp_path / "long.oni"),) * 2, tmp_path)
 
@@ -208,9 +202,7 @@ def soak(uri: str, folder: Path, count: int, turns: Turns) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
-def test_a_viewer_stopped_for_half_a_minute_slows_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_viewer_stopped_for_half_a_minute_slows_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both selectors on a live source, saved and sent to a viewer that is stopped meanwhile."""
     source = Watched(open_source("virtual:workstation?size=320x240&live=1"))
     monkeypatch.setattr(session_module, "open_source", lambda _: source)

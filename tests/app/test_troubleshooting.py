@@ -83,8 +83,7 @@ def test_the_table_holds_what_is_provoked_here() -> None:
 
 
 @pytest.mark.parametrize(
-    "message",
-    [pytest.param(each, marks=[pytest.mark.openni] if each in WITH_OPENNI2 else []) for each in PROVOKED],
+    "message", [pytest.param(each, marks=[pytest.mark.openni] if each in WITH_OPENNI2 else []) for each in PROVOKED]
 )
 def test_it_says_so(
     message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]

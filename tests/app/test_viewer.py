@@ -198,9 +198,7 @@ def test_unwritable_file_is_refused_at_once(tmp_path: Path, place: str) -> None:
 
 def test_a_refused_run_leaves_an_older_file_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "old.rrd").write_bytes(b"precious")
-    chosen = dataclasses.replace(
-        HEADLESS, save=tmp_path / "old.rrd", connect="rerun+http://127.0.0.1:1/proxy"
-    )
+    chosen = dataclasses.replace(HEADLESS, save=tmp_path / "old.rrd", connect="rerun+http://127.0.0.1:1/proxy")
     with pytest.raises(ViewerError, match="no viewer listens"):
         Viewer(chosen, live=False, times=StageTimes())
     assert (tmp_path / "old.rrd").read_bytes() == b"precious"
@@ -265,9 +263,7 @@ def test_a_recording_waits_for_its_file_and_a_sensor_for_nothing(
         assert saved in (viewer.FILE_QUEUE, viewer.FILE_QUEUE + 1)  # and one in hand
 
 
-def test_a_write_that_fails_costs_no_more_than_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_write_that_fails_costs_no_more_than_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
     monkeypatch.setattr(sinks, "CHECK_EVERY_S", 0.0)  # make sure after every step
     shown = Viewer(chosen, live=False, times=StageTimes(), frames=2000)
@@ -344,9 +340,7 @@ def test_two_runs_serve_on_ports_of_their_own() -> None:
 
 def test_taken_port_is_refused() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        chosen = dataclasses.replace(
-            HEADLESS, serve=True, serve_address=f"127.0.0.1:{taken.getsockname()[1]}"
-        )
+        chosen = dataclasses.replace(HEADLESS, serve=True, serve_address=f"127.0.0.1:{taken.getsockname()[1]}")
         with pytest.raises(ViewerError, match="cannot serve"):
             Viewer(chosen, live=True, times=StageTimes())
 
@@ -530,9 +524,7 @@ def test_web_viewer_shows_the_run(tmp_path: Path) -> None:
     web, grpc = map(str, ports)
     serving = [executable, str(recording), "--serve-web", "--bind", "127.0.0.1"]
     server = subprocess.Popen(
-        [*serving, "--web-viewer-port", web, "--port", grpc],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        [*serving, "--web-viewer-port", web, "--port", grpc], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     stream = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{grpc}%2Fproxy"
     SlowPage.viewer_url = f"http://127.0.0.1:{web}/?url={stream}&renderer=webgl"

@@ -39,9 +39,7 @@ def test_nothing_is_left_after_an_error(started: list[subprocess.Popen[bytes]]) 
     assert started[0].returncode != 0
 
 
-def test_warm_kernels_need_no_help(
-    started: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_warm_kernels_need_no_help(started: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(precompile, "PATIENCE_S", 60.0)
     with precompile.compiling_beside():
         pass

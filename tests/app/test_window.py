@@ -36,12 +36,7 @@ pytestmark = pytest.mark.skipif(
 )
 QUICK = ("--seeds.rows", "24", "--seeds.columns", "32", "--gas.nodes", "60")
 SCENE = "virtual:ball?size=160x120&frames={}"
-DRIVER_SETTINGS = (
-    "VK_ICD_FILENAMES",
-    "VK_DRIVER_FILES",
-    "LIBGL_DRIVERS_PATH",
-    "__EGL_VENDOR_LIBRARY_FILENAMES",
-)
+DRIVER_SETTINGS = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES", "LIBGL_DRIVERS_PATH", "__EGL_VENDOR_LIBRARY_FILENAMES")
 
 
 class Screen:
@@ -212,9 +207,7 @@ def test_a_run_opens_a_window_that_shows_every_frame_and_stays(screen: Screen, t
         joining = shlex.split(re.search(r"join with '(.+)'", "".join(said))[1])  # type: ignore[index]
         assert f":{port}/" not in joining[-1]
         free = str(free_port())
-        joined = subprocess.Popen(
-            [*joining, "--port", free], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+        joined = subprocess.Popen([*joining, "--port", free], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         until(lambda: window.listens(("127.0.0.1", int(free))))
         until(lambda: frames_in(int(free)))
         assert screen.windows == 2
@@ -353,9 +346,7 @@ def test_a_viewer_of_another_version_or_on_another_screen_is_not_taken(
     assert not seen.fits
 
 
-def test_a_window_that_closes_is_told_and_one_that_is_closing_is_not_used(
-    screen: Screen, tmp_path: Path
-) -> None:
+def test_a_window_that_closes_is_told_and_one_that_is_closing_is_not_used(screen: Screen, tmp_path: Path) -> None:
     with running("replay", SCENE.format(1_000_000), "--realtime", cwd=tmp_path) as process:
         until(lambda: [port for port in screen.viewers if window.listens(("127.0.0.1", port))])
         (port,) = screen.viewers

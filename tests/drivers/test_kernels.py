@@ -134,10 +134,7 @@ def flipped(data: bytes) -> bytes:
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 @pytest.mark.parametrize("damage", [emptied, cut, overwritten, flipped])
 def test_a_damaged_kernel_is_compiled_anew_and_that_is_said_once(
-    ending: str,
-    damage: Callable[[bytes], bytes],
-    run_twice: Callable[[], tuple[int, int, list[str]]],
-    tmp_path: Path,
+    ending: str, damage: Callable[[bytes], bytes], run_twice: Callable[[], tuple[int, int, list[str]]], tmp_path: Path
 ) -> None:
     assert run_twice() == (41, 1, [])
     assert run_twice() == (41, 0, [])
@@ -149,9 +146,7 @@ def test_a_damaged_kernel_is_compiled_anew_and_that_is_said_once(
     assert run_twice() == (41, 0, [])
 
 
-def test_another_source_is_no_damage(
-    run_twice: Callable[[], tuple[int, int, list[str]]], tmp_path: Path
-) -> None:
+def test_another_source_is_no_damage(run_twice: Callable[[], tuple[int, int, list[str]]], tmp_path: Path) -> None:
     run_twice()
     (tmp_path / "module.py").write_text(KERNEL.format(extra=200))
     assert run_twice() == (240, 1, [])

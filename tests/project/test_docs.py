@@ -37,10 +37,7 @@ def helps() -> dict[str, str]:
 
     return {
         name: subprocess.run(
-            [sys.executable, "-m", "selective_depth.app", name, "--help"],
-            capture_output=True,
-            text=True,
-            check=True,
+            [sys.executable, "-m", "selective_depth.app", name, "--help"], capture_output=True, text=True, check=True
         ).stdout
         for name in COMMANDS
     }
@@ -54,9 +51,7 @@ def help_of() -> dict[str, str]:
 @pytest.mark.parametrize("code", blocks("python"))
 def test_python_runs_as_written(code: str, tmp_path: Path) -> None:
     (tmp_path / "recordings").symlink_to(ROOT / "recordings")
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120
-    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
 
 

@@ -152,9 +152,7 @@ def score_reference(samples: Samples, rule: StepSelector) -> npt.NDArray[np.floa
         missed = squared[(depth < 0) & (squared <= limit)]
         chance = weight.sum() / (weight.sum() + (1 / (missed ** (rule.falloff / 2) + 1)).sum())
         gaps = np.sqrt([voters[0][0], voters[min(1, len(voters) - 1)][0]])
-        score[v, u] = (
-            (spread + rule.noise_mm**2) * chance**0.5 * min(gaps.mean(), rule.gap * samples.pitch_px)
-        )
+        score[v, u] = (spread + rule.noise_mm**2) * chance**0.5 * min(gaps.mean(), rule.gap * samples.pitch_px)
     return score
 
 

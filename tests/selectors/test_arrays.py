@@ -73,9 +73,7 @@ FUNCTIONS: dict[str, Callable[[npt.NDArray[Any]], npt.NDArray[Any]]] = {
     "reconstruct": lambda d: reconstruct(UV, d[UV[:, 1], UV[:, 0]], PLAIN.shape),
     "improvement_scattered": lambda d: improvement_scattered(UV, d[UV[:, 1], UV[:, 0]], PLAIN.shape).raw,
     "ImprovementSelector": lambda d: ImprovementSelector().select(SeedGrid.from_array(d, (12, 16))).score,
-    "NeuralGasSelector": lambda d: (
-        NeuralGasSelector(nodes=40).select(SeedGrid.from_array(d, (12, 16))).nodes_mm
-    ),
+    "NeuralGasSelector": lambda d: NeuralGasSelector(nodes=40).select(SeedGrid.from_array(d, (12, 16))).nodes_mm,
     "SurfaceSelector": lambda d: SurfaceSelector().select(SeedGrid.from_array(d, (12, 16))).score,
     "acquire": answered,
 }
@@ -230,11 +228,7 @@ print(tried)
 def test_no_kernel_leaves_its_arrays(tmp_path: Path) -> None:
     """Every kernel with the bounds of its arrays checked, on random and extreme input."""
     done = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            BOUNDS.replace("ROUNDS", "40").replace("FILE", repr(str(tmp_path / "some.ply"))),
-        ],
+        [sys.executable, "-c", BOUNDS.replace("ROUNDS", "40").replace("FILE", repr(str(tmp_path / "some.ply")))],
         cwd=ROOT,
         env={**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)},
         capture_output=True,

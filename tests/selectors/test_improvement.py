@@ -364,8 +364,7 @@ def test_no_seams(shared_data):
         seeds = SeedGrid.from_array(depth)
         found = ImprovementSelector().select(seeds)
         worst.append(
-            step_shares(found.raw, found.known, seeds.columns, 1)
-            + step_shares(found.raw, found.known, seeds.rows, 0)
+            step_shares(found.raw, found.known, seeds.columns, 1) + step_shares(found.raw, found.known, seeds.rows, 0)
         )
     print("columns: right, left of seeds, between cells; rows likewise")
     print(np.max(worst, axis=0).round(2), "mean", np.mean(worst, axis=0).round(2))

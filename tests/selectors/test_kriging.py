@@ -95,9 +95,7 @@ def test_a_window_by_sums_equals_eq_13_near_w_2(system):
     pixels = np.stack((u.ravel(), v.ravel()), axis=1)
     for n in range(0, len(pixels), 5):
         around = pixels[n] + np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)])
-        expected = direct_improvement(
-            uv, depth.astype(float), pixels[n], around, a, b, 1.999, depth.min() / 2
-        )
+        expected = direct_improvement(uv, depth.astype(float), pixels[n], around, a, b, 1.999, depth.min() / 2)
         if b >= MOMENTS_NUGGET * a:
             assert improvement.ravel()[n] == pytest.approx(expected, rel=5e-3, abs=1e-9)
 
@@ -127,8 +125,7 @@ def test_kriging_weights_reproduce_a_general_solver():
     uv = np.array([(105, 204), (100, 200), (110, 201), (103, 208), (109, 208)])
     base = np.full(5, 5000.0, np.float32)
     estimate = [
-        window(uv, base + 1000 * np.eye(5, dtype=np.float32)[n], 3.0, 20.0, 1.4, 101, 201, 9, 7)[0]
-        for n in range(5)
+        window(uv, base + 1000 * np.eye(5, dtype=np.float32)[n], 3.0, 20.0, 1.4, 101, 201, 9, 7)[0] for n in range(5)
     ]
     weights = (np.stack(estimate) - 5000) / 1000
     v, u = np.mgrid[201:208, 101:110]

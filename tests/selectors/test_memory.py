@@ -53,11 +53,7 @@ def fused_slowly(values: list[float]) -> tuple[float, int]:
 
 @settings(max_examples=80, deadline=None)
 @given(
-    st.lists(
-        st.one_of(st.integers(990, 1010), st.integers(2490, 2510), st.integers(1, 60000)),
-        min_size=1,
-        max_size=70,
-    )
+    st.lists(st.one_of(st.integers(990, 1010), st.integers(2490, 2510), st.integers(1, 60000)), min_size=1, max_size=70)
 )
 def test_observations_are_fused_as_the_rule_says(values: list[int]) -> None:
     memory = Memory.of((2, 2))
@@ -179,9 +175,7 @@ def test_a_surface_whose_samples_change_equals_one_made_anew(seed: int) -> None:
         for new in batches:  # in the same order: four samples on a circle may be split either way
             anew.add(new, known[new[:, 1], new[:, 0]])
         for name in ("depth_mm", "plain", "nearest", "samples_mm"):
-            np.testing.assert_array_equal(
-                getattr(surface.layers, name), getattr(anew.layers, name), err_msg=name
-            )
+            np.testing.assert_array_equal(getattr(surface.layers, name), getattr(anew.layers, name), err_msg=name)
 
 
 SELECTORS = {

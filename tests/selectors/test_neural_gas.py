@@ -239,9 +239,7 @@ def check_quality(folder: Path, frames: list[tuple[str, int]], side: int, nodes:
     differences = []
     for name, index in frames:
         seeds = seeds_of(folder, name, index, (side, side))
-        first, second = (
-            NeuralGasSelector(nodes, algorithm="exact", seed=seed).select(seeds) for seed in (0, 1)
-        )
+        first, second = (NeuralGasSelector(nodes, algorithm="exact", seed=seed).select(seeds) for seed in (0, 1))
         quick = NeuralGasSelector(nodes, seed=0).select(seeds)
         error = quantisation_error(seeds.points_mm, quick.nodes_mm)
         assert error == pytest.approx(quick.quantisation_error_mm, rel=2e-3)
@@ -485,10 +483,7 @@ def panorama() -> SeedGrid:
     azimuth = np.linspace(-np.pi, np.pi, 512, endpoint=False)
     height = np.linspace(-500, 500, 64)
     points = np.stack(
-        np.broadcast_arrays(
-            3000 * np.sin(azimuth)[None, :], height[:, None], 3000 * np.cos(azimuth)[None, :]
-        ),
-        axis=-1,
+        np.broadcast_arrays(3000 * np.sin(azimuth)[None, :], height[:, None], 3000 * np.cos(azimuth)[None, :]), axis=-1
     )
     return SeedGrid.from_array(np.full((64, 512), 3000.0), (32, 128), points_mm=points.astype(np.float32))
 

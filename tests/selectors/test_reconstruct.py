@@ -152,9 +152,7 @@ def candidates(uv: Pixels, depth: npt.NDArray[np.float64], shape: tuple[int, int
 
 @settings(max_examples=25, deadline=None)
 @given(scattered(most=14), st.integers(0, 2**32 - 1), st.sampled_from([0.0, 40.0, 3000.0]))
-def test_reconstruction_follows_the_protocol(
-    case: tuple[tuple[int, int], Pixels], seed: int, spread_mm: float
-) -> None:
+def test_reconstruction_follows_the_protocol(case: tuple[tuple[int, int], Pixels], seed: int, spread_mm: float) -> None:
     shape, uv = case
     depth = 1000 + np.floor(np.random.default_rng(seed).random(len(uv)) * (spread_mm + 1))
     model = reconstruct(uv, depth, shape)
@@ -171,10 +169,7 @@ def test_a_plane_is_reconstructed_exactly_and_samples_are_kept() -> None:
     uv, depth = seeds.lattice_uv.reshape(-1, 2), seeds.depth_mm.ravel()
     model = reconstruct(uv, depth, (60, 80))
     inside = (
-        (columns >= uv[:, 0].min())
-        & (columns <= uv[:, 0].max())
-        & (rows >= uv[:, 1].min())
-        & (rows <= uv[:, 1].max())
+        (columns >= uv[:, 0].min()) & (columns <= uv[:, 0].max()) & (rows >= uv[:, 1].min()) & (rows <= uv[:, 1].max())
     )
     np.testing.assert_allclose(model[inside], plane[inside], rtol=1e-6)
     np.testing.assert_array_equal(model[uv[:, 1], uv[:, 0]], depth)
@@ -234,9 +229,7 @@ def test_threads_change_nothing(threads: int) -> None:
     rng = np.random.default_rng(1)
     uv = np.unique(rng.integers(0, 90, (500, 2)), axis=0)
     depth = rng.integers(500, 4000, len(uv))
-    np.testing.assert_array_equal(
-        reconstruct(uv, depth, (90, 90), threads=threads), reconstruct(uv, depth, (90, 90))
-    )
+    np.testing.assert_array_equal(reconstruct(uv, depth, (90, 90), threads=threads), reconstruct(uv, depth, (90, 90)))
 
 
 def test_what_does_not_fit_is_refused_in_a_sentence() -> None:

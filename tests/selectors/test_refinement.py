@@ -19,9 +19,7 @@ def flat(lattice: tuple[int, int], shape: tuple[int, int] = (120, 160)) -> SeedG
 
 
 @example(rows=15, columns=2, shots=4473, seed=0)  # its rows are full long before its columns
-@given(
-    rows=st.integers(1, 40), columns=st.integers(1, 40), shots=st.integers(0, 20_000), seed=st.integers(0, 99)
-)
+@given(rows=st.integers(1, 40), columns=st.integers(1, 40), shots=st.integers(0, 20_000), seed=st.integers(0, 99))
 @settings(deadline=None)
 def test_new_pixels_are_no_seeds_not_deep_in_holes_and_within_the_budget(
     rows: int, columns: int, shots: int, seed: int

@@ -68,9 +68,7 @@ def build_driver() -> Path:
         with tempfile.TemporaryDirectory(dir=library.parent) as folder:
             made = Path(folder) / "driver.so"
             flags = ["-shared", "-fPIC", "-O2", "-std=c++17", "-Wall", "-Wextra", "-Werror"]
-            subprocess.run(
-                [compiler, *flags, f"-I{HEADERS}", str(SOURCE), "-o", str(made), "-pthread"], check=True
-            )
+            subprocess.run([compiler, *flags, f"-I{HEADERS}", str(SOURCE), "-o", str(made), "-pthread"], check=True)
             made.replace(library)
     return library
 

@@ -33,10 +33,7 @@ TOPIC = "/camera/depth/image_raw"
 @pytest.fixture(scope="module")
 def frames() -> list[DepthFrame]:
     with open_source("virtual:workstation?size=160x120") as source:
-        return [
-            DepthFrame(source.read().depth_mm, n, 1_700_000_000_000_000 + n * 33_333, CAMERA)
-            for n in range(COUNT)
-        ]
+        return [DepthFrame(source.read().depth_mm, n, 1_700_000_000_000_000 + n * 33_333, CAMERA) for n in range(COUNT)]
 
 
 def header(store: Any, stamp_us: int) -> Any:
@@ -71,9 +68,7 @@ def compressed(store: Any, frame: DepthFrame, encoding: str) -> Any:
         values = np.where(frame.depth_mm > 0, near / metres + far, 0).astype(np.uint16)
     data = struct.pack("<iff", 0, near, far) + cv2.imencode(".png", values)[1].tobytes()
     return store.types["sensor_msgs/msg/CompressedImage"](
-        header(store, frame.timestamp_us),
-        format=f"{encoding}; compressedDepth png",
-        data=np.frombuffer(data, np.uint8),
+        header(store, frame.timestamp_us), format=f"{encoding}; compressedDepth png", data=np.frombuffer(data, np.uint8)
     )
 
 
@@ -132,9 +127,7 @@ def write(folder: Path, kind: str, topics: Topics, frames: list[DepthFrame]) -> 
         for frame in frames:
             for topic, make in topics.items():
                 message = make(store, frame)
-                data = (store.serialize_ros1 if store is ROS1 else store.serialize_cdr)(
-                    message, message.__msgtype__
-                )
+                data = (store.serialize_ros1 if store is ROS1 else store.serialize_cdr)(message, message.__msgtype__)
                 writer.write(made[topic], frame.timestamp_us * 1000, data)
     return next(path.glob("*.mcap")) if kind.startswith("mcap") else path
 
@@ -235,9 +228,7 @@ def test_realsense_recordings_say_their_unit(tmp_path: Path, frames: list[DepthF
 
 @pytest.mark.parametrize("kind", ["bag", "ros2", "mcap"])
 @pytest.mark.parametrize("keep", [0.0, 0.5, 0.97])
-def test_a_cut_bag_says_how_to_mend_it(
-    tmp_path: Path, frames: list[DepthFrame], kind: str, keep: float
-) -> None:
+def test_a_cut_bag_says_how_to_mend_it(tmp_path: Path, frames: list[DepthFrame], kind: str, keep: float) -> None:
     path = write(tmp_path, kind, forms("mm"), frames[:5])
     cut = next(path.glob("*.db3")) if kind == "ros2" else path
     data = cut.read_bytes()

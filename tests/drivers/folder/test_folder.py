@@ -185,9 +185,7 @@ def test_frames_before_a_damaged_one_stay_good(tmp_path: Path) -> None:
 
 def test_what_is_written_is_read_back_bit_by_bit(tmp_path: Path) -> None:
     camera = Camera(8, 6, 7.25, 7.5, 3.9, 2.8)
-    frames = [
-        DepthFrame(_depth(seed=number), number, 10**15 + 33_366 * number, camera) for number in range(3)
-    ]
+    frames = [DepthFrame(_depth(seed=number), number, 10**15 + 33_366 * number, camera) for number in range(3)]
     out = tmp_path / "neü er" / "folder"
     assert write_folder(out, frames, fps=29.97) == 3
     with RecordedFolder(out) as folder:
@@ -350,9 +348,7 @@ def test_damaged_files_print_nothing(tmp_path: Path, capfd: pytest.CaptureFixtur
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize(
-    "line", ["1.0 ../secret.png", "1.0 /etc/secret.png", "1.0 depth/../../x.png", "1.0 C:\\x.png"]
-)
+@pytest.mark.parametrize("line", ["1.0 ../secret.png", "1.0 /etc/secret.png", "1.0 depth/../../x.png", "1.0 C:\\x.png"])
 def test_a_tum_list_cannot_lead_outside_of_its_folder(tmp_path: Path, line: str) -> None:
     (tmp_path / "depth.txt").write_text(line)
     with pytest.raises(DamagedRecordingError, match="outside of the folder"):
@@ -411,11 +407,7 @@ def test_any_bytes_as_sidecar_give_settings_or_a_named_error(
 
 
 _VALUES = st.recursive(
-    st.booleans()
-    | st.integers(-(2**70), 2**70)
-    | st.floats()
-    | st.text(max_size=5)
-    | st.sampled_from([6, 8]),
+    st.booleans() | st.integers(-(2**70), 2**70) | st.floats() | st.text(max_size=5) | st.sampled_from([6, 8]),
     lambda inner: (
         st.lists(inner, max_size=3)
         | st.dictionaries(st.sampled_from(["width", "height", "fx", "fy", "cx", "cy"]), inner, min_size=5)
@@ -425,9 +417,7 @@ _VALUES = st.recursive(
 
 
 @settings(max_examples=200, deadline=None)
-@given(
-    entries=st.dictionaries(st.sampled_from([*Sidecar.__dataclass_fields__, "other"]), _VALUES, max_size=5)
-)
+@given(entries=st.dictionaries(st.sampled_from([*Sidecar.__dataclass_fields__, "other"]), _VALUES, max_size=5))
 def test_any_toml_as_sidecar_opens_the_folder_or_gives_a_named_error(
     tmp_path_factory: pytest.TempPathFactory, entries: dict[str, object]
 ) -> None:
@@ -519,10 +509,7 @@ def test_names_whose_two_readings_agree_are_no_matter(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["out.oni", "out"])
 def test_a_clock_that_wraps_is_named_and_leaves_nothing_in_the_way(tmp_path: Path, name: str) -> None:
     times_us = [4294917295, 4294950628, 16666]
-    frames = [
-        DepthFrame(_depth(6, 8), index, time_us, Camera.kinect(8, 6))
-        for index, time_us in enumerate(times_us)
-    ]
+    frames = [DepthFrame(_depth(6, 8), index, time_us, Camera.kinect(8, 6)) for index, time_us in enumerate(times_us)]
     write_folder(tmp_path / "wrapped", frames)
     out = tmp_path / name
     if name == "out":  # a folder can hold them

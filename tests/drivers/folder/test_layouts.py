@@ -183,21 +183,9 @@ ROWS = [
         NAMED_US,
         scale="its own",
     ),
+    Row("ScanNet", "scene0000_00", "depth/{number}.png", OWN, beside=text("intrinsic/intrinsic_depth.txt", MATRIX)),
     Row(
-        "ScanNet",
-        "scene0000_00",
-        "depth/{number}.png",
-        OWN,
-        beside=text("intrinsic/intrinsic_depth.txt", MATRIX),
-    ),
-    Row(
-        "BOP",
-        "000001",
-        "depth/{number:06d}.png",
-        OWN,
-        at_scale(10_000),
-        text("scene_camera.json", BOP),
-        scale="10000",
+        "BOP", "000001", "depth/{number:06d}.png", OWN, at_scale(10_000), text("scene_camera.json", BOP), scale="10000"
     ),
     Row(
         "Replica",
@@ -208,17 +196,7 @@ ROWS = [
         text(
             "cam_params.json",
             json.dumps(
-                {
-                    "camera": {
-                        "w": 640,
-                        "h": 480,
-                        "fx": 577.5,
-                        "fy": 578.25,
-                        "cx": 318.75,
-                        "cy": 242.5,
-                        "scale": 6553.5,
-                    }
-                }
+                {"camera": {"w": 640, "h": 480, "fx": 577.5, "fy": 578.25, "cx": 318.75, "cy": 242.5, "scale": 6553.5}}
             ),
         ),
         scale="6553.5",
@@ -289,14 +267,7 @@ ROWS = [
         beside=beside("00000-color.png"),
     ),
     Row("RealSense rs-convert", "converted", "walk_Depth_{number:04d}.png", Camera.kinect()),
-    Row(
-        "Matterport3D",
-        "matterport_depth_images",
-        "ab_d1_{number}.png",
-        Camera.kinect(),
-        at_scale(4000),
-        scale="4000",
-    ),
+    Row("Matterport3D", "matterport_depth_images", "ab_d1_{number}.png", Camera.kinect(), at_scale(4000), scale="4000"),
     Row("Redwood", "lobby", "depth/{number:07d}-{us:012d}.png", XTION, times_us=NAMED_US),
 ]
 
@@ -346,9 +317,7 @@ def test_a_layouts_mark_of_nothing_is_nothing(tmp_path: Path, name: str) -> None
     assert not depth_mm[0].any() and depth_mm[1:].all()
 
 
-def test_millimetres_under_a_list_are_refused_until_the_scale_is_given(
-    tmp_path: Path, scene: list[Values]
-) -> None:
+def test_millimetres_under_a_list_are_refused_until_the_scale_is_given(tmp_path: Path, scene: list[Values]) -> None:
     root = make(Row("TUM", "lab", BY_STAMP, XTION, beside=listing), tmp_path, scene)
     with pytest.raises(SourceError, match=r"scale of .*lab' is not known.*--scale 1000"):
         open_source(root)
@@ -428,9 +397,7 @@ def test_an_exr_image_is_read(tmp_path: Path, scene: list[Values]) -> None:
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float32, np.float64])
 @pytest.mark.parametrize("ending", ["npy", "npz"])
-def test_an_array_of_frames_is_a_source(
-    tmp_path: Path, scene: list[Values], ending: str, dtype: type
-) -> None:
+def test_an_array_of_frames_is_a_source(tmp_path: Path, scene: list[Values], ending: str, dtype: type) -> None:
     path = tmp_path / f"walk.{ending}"
     whole = np.stack(scene).astype(dtype)
     np.save(path, whole) if ending == "npy" else np.savez_compressed(path, depth_mm=whole)
@@ -442,9 +409,7 @@ def test_an_array_of_frames_is_a_source(
         assert abs(int(source.read().depth_mm.max()) - int(scene[0].max()) / 2) <= 0.5
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"\x93NUMPY", np.zeros(3), np.zeros((2, 3), np.uint8), np.array(["a"])]
-)
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY", np.zeros(3), np.zeros((2, 3), np.uint8), np.array(["a"])])
 def test_an_array_that_is_no_depth_is_named(tmp_path: Path, content: Any) -> None:
     path = tmp_path / "a.npy"
     path.write_bytes(content) if isinstance(content, bytes) else np.save(path, content)

@@ -192,9 +192,7 @@ def test_a_clock_that_jumps_goes_on_rising(times_us: list[int], mended_us: list[
     assert mended_times([]) == ([], None)
 
 
-def test_a_jump_is_said_and_mended(
-    tmp_path: Path, scene: list[Depth], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_jump_is_said_and_mended(tmp_path: Path, scene: list[Depth], capsys: pytest.CaptureFixture[str]) -> None:
     times_us = [0, 33_333, 2**64 - 10_000_000, 2**64 - 9_966_667]
     path = write(tmp_path / "a.oni", scene, times_us=times_us)
     assert run(["check", str(path), "--repair", str(tmp_path / "b.oni")]) == 0

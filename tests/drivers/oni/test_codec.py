@@ -98,15 +98,12 @@ def test_what_is_encoded_is_decoded_bit_by_bit_here_and_by_the_reference(depth_m
 @given(
     first=st.integers(0, 65535),
     body=st.lists(
-        st.sampled_from([0x00, 0x66, 0x6D, 0x6F, 0xCC, 0xE1, 0xEF, 0xFF, 0x80, 0xC1, 0x12])
-        | st.integers(0, 255),
+        st.sampled_from([0x00, 0x66, 0x6D, 0x6F, 0xCC, 0xE1, 0xEF, 0xFF, 0x80, 0xC1, 0x12]) | st.integers(0, 255),
         max_size=20,
     ),
     short=st.integers(-1, 1),
 )
-def test_any_bytes_decode_as_the_reference_says_or_not_at_all(
-    first: int, body: list[int], short: int
-) -> None:
+def test_any_bytes_decode_as_the_reference_says_or_not_at_all(first: int, body: list[int], short: int) -> None:
     coded = first.to_bytes(2, "little") + bytes(body)
     expected = _reference_decode(coded, None)
     pixels = max(1, (len(expected) if expected else len(body)) + short)
@@ -145,18 +142,7 @@ def test_codes_mean_what_the_table_says(payload: str, expected: list[int]) -> No
 
 @pytest.mark.parametrize(
     "payload",
-    [
-        "",
-        "0a",
-        "0a00 e0",
-        "0a00 f1 00",
-        "0a00 d6",
-        "0a00 6e",
-        "0a00 ff",
-        "0a00 ff 12",
-        "0a00 6f",
-        "0a00 6d 66",
-    ],
+    ["", "0a", "0a00 e0", "0a00 f1 00", "0a00 d6", "0a00 6e", "0a00 ff", "0a00 ff 12", "0a00 6f", "0a00 6d 66"],
 )
 def test_codes_that_no_encoder_makes_are_damage(payload: str) -> None:
     for pixels in range(1, 8):

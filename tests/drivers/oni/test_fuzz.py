@@ -172,6 +172,5 @@ def _assert_valid(name: str, frames: list[DepthFrame], expected: list[DepthFrame
 
 def _differing(frames: list[DepthFrame], expected: list[DepthFrame]) -> int:
     return sum(
-        not np.array_equal(frame.depth_mm, original.depth_mm)
-        for frame, original in zip(frames, expected, strict=False)
+        not np.array_equal(frame.depth_mm, original.depth_mm) for frame, original in zip(frames, expected, strict=False)
     )

@@ -19,12 +19,7 @@ from oni_mutations import cuts, mutations
 from raw_oni_player import digest_of, play_all
 from virtual_sensor import record_oni
 
-from selective_depth.drivers.errors import (
-    DamagedRecordingError,
-    OutputError,
-    SourceEndedError,
-    SourceNotFoundError,
-)
+from selective_depth.drivers.errors import DamagedRecordingError, OutputError, SourceEndedError, SourceNotFoundError
 from selective_depth.drivers.folder import RecordedFolder
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.oni import OniReader, OniReport, export_oni, inspect_oni, repair_oni
@@ -44,14 +39,7 @@ from selective_depth.drivers.oni.records import (
     NodeType,
     pack_property,
 )
-from selective_depth.drivers.oni.writer import (
-    OniWriter,
-    RecordWriter,
-    depth_properties,
-    integer,
-    structure,
-    write_oni,
-)
+from selective_depth.drivers.oni.writer import OniWriter, RecordWriter, depth_properties, integer, structure, write_oni
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.openni.runtime import find_runtime
 
@@ -134,17 +122,13 @@ def test_the_real_player_delivers_what_is_written_and_what_is_repaired(
     paths = [recording, repaired, killed, wide]
     outcomes = list(play_all(paths, find_runtime().path, patience_s=3.0))
     for path, outcome, count in zip(paths, outcomes, (COUNT, COUNT - 1, COUNT - 1, 2), strict=True):
-        expected = digest_of(
-            (frame.index + 1, *frame.shape, frame.depth_mm.tobytes()) for frame in _read(path)
-        )
+        expected = digest_of((frame.index + 1, *frame.shape, frame.depth_mm.tobytes()) for frame in _read(path))
         assert (outcome.ended, outcome.frames) == ("frames", count), path.name
         assert (outcome.frames, outcome.digest) == expected, path.name
 
 
 @pytest.mark.openni
-def test_what_openni2s_recorder_swaps_is_read_rightly_and_repaired(
-    virtual_driver: Path, tmp_path: Path
-) -> None:
+def test_what_openni2s_recorder_swaps_is_read_rightly_and_repaired(virtual_driver: Path, tmp_path: Path) -> None:
     """A lone last pixel after a run: the recorder's flaw, seen on real frames of a Kinect."""
     depth = np.full((3, 480, 640), 1000, np.uint16)
     depth[:, 0, 0] = 3000
@@ -395,9 +379,7 @@ def test_timestamps_are_held_against_the_seek_table(recording: Path) -> None:
         (90, b"\xff", "no sound seek table"),
     ],
 )
-def test_every_wrong_number_is_found_and_named(
-    recording: Path, place: int, value: bytes, sentence: str
-) -> None:
+def test_every_wrong_number_is_found_and_named(recording: Path, place: int, value: bytes, sentence: str) -> None:
     data = bytearray(recording.read_bytes())
     data[place : place + len(value)] = value
     recording.write_bytes(data)
@@ -491,9 +473,7 @@ def test_files_of_openni_1_are_read_and_brought_up_to_date(tmp_path: Path) -> No
     out = bytearray(FILE_HEADER.pack(b"NI10", 1, 0, 0, 4, 10**9, 1))
 
     def add(kind: Kind, fields: bytes = b"", payload: bytes = b"") -> None:
-        out.extend(
-            OLD_HEADER.pack(MAGIC, kind, 1, OLD_HEADER.size + len(fields), len(payload), 0) + fields + payload
-        )
+        out.extend(OLD_HEADER.pack(MAGIC, kind, 1, OLD_HEADER.size + len(fields), len(payload), 0) + fields + payload)
 
     add(Kind.NODE_ADDED_4, b"\x07\0\0\0Depth1\0" + struct.pack("<I4s", NodeType.DEPTH, b"16zT"))
     properties = depth_properties(CAMERA, 30)

@@ -38,9 +38,7 @@ def check_exact(path: Path, sample: OniSample) -> None:
             np.testing.assert_array_equal(frame.depth_mm, depth_mm)
 
 
-def test_every_frame_once_bit_exact_twenty_times_from_odd_paths(
-    oni_sample: OniSample, tmp_path: Path
-) -> None:
+def test_every_frame_once_bit_exact_twenty_times_from_odd_paths(oni_sample: OniSample, tmp_path: Path) -> None:
     odd = tmp_path / "mit Leerzeichen" / "Übung ボール.oni"
     long = tmp_path / ("d" * 200) / ("e" * 200) / "long.oni"
     no_text = tmp_path / os.fsdecode(b"\xff\xfe.oni")
@@ -112,9 +110,7 @@ def test_two_processes_replay_one_file_at_once(oni_sample: OniSample, tmp_path: 
 
 
 @pytest.mark.parametrize("keep", [0.1, 0.5])
-def test_a_cut_file_is_good_as_far_as_it_goes_and_says_so(
-    oni_sample: OniSample, tmp_path: Path, keep: float
-) -> None:
+def test_a_cut_file_is_good_as_far_as_it_goes_and_says_so(oni_sample: OniSample, tmp_path: Path, keep: float) -> None:
     cut = tmp_path / "cut.oni"
     data = oni_sample.path.read_bytes()
     cut.write_bytes(data[: int(len(data) * keep)])

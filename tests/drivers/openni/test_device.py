@@ -27,13 +27,7 @@ from selective_depth.drivers.errors import (
 )
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.open import open_source
-from selective_depth.drivers.openni import (
-    DeviceInfo,
-    DeviceSettings,
-    OpenNIDevice,
-    list_devices,
-    runtime_version,
-)
+from selective_depth.drivers.openni import DeviceInfo, DeviceSettings, OpenNIDevice, list_devices, runtime_version
 from selective_depth.drivers.openni.device import _Count
 from selective_depth.drivers.openni.process import Message
 
@@ -185,9 +179,7 @@ def test_a_few_wrong_frames_are_thrown_away_and_counted(virtual_sensor: VirtualS
         assert device.restarts == 0
 
 
-def test_a_hang_of_the_runtime_is_survived(
-    virtual_sensor: VirtualSensor, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hang_of_the_runtime_is_survived(virtual_sensor: VirtualSensor, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("selective_depth.drivers.openni.device._HANG_S", 0.7)
     with OpenNIDevice() as device:
         device.read()
@@ -211,9 +203,7 @@ def test_a_stall_that_lasts_is_ended_by_opening_it_afresh(
         sensor_frame(next_frame(device))
 
 
-def test_a_fault_of_our_own_reaches_the_reader(
-    virtual_sensor: VirtualSensor, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fault_of_our_own_reaches_the_reader(virtual_sensor: VirtualSensor, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(self: _Count, message: Message) -> tuple[int, int]:
         raise ZeroDivisionError("on purpose")
 
@@ -337,9 +327,7 @@ def test_two_sensors_at_once(virtual_sensor: VirtualSensor) -> None:
         assert (one.device.uri, other.device.uri) == ("virtual://0", "virtual://1")
 
 
-def test_a_sensor_that_hangs_when_opened(
-    virtual_sensor: VirtualSensor, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sensor_that_hangs_when_opened(virtual_sensor: VirtualSensor, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("selective_depth.drivers.openni.device._OPEN_S", 0.5)
     virtual_sensor.set(hang_open=1)
     with pytest.raises(DeviceRefusedError, match="hangs"):
@@ -439,8 +427,7 @@ while True:
 
 
 @pytest.mark.parametrize(
-    "end",
-    ["exit", "exception", "killed while its fork lives on", signal.SIGINT, signal.SIGTERM, signal.SIGKILL],
+    "end", ["exit", "exception", "killed while its fork lives on", signal.SIGINT, signal.SIGTERM, signal.SIGKILL]
 )
 def test_nothing_is_left_whichever_way_the_program_ends(
     virtual_sensor: VirtualSensor, end: str | signal.Signals

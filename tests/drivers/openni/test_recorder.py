@@ -60,9 +60,7 @@ def test_every_frame_from_the_first_on(virtual_sensor: VirtualSensor, tmp_path: 
     assert inspect_oni(out).tail_bytes == 0
 
 
-def test_frames_whose_last_pixel_differs_replay_bit_for_bit(
-    virtual_sensor: VirtualSensor, tmp_path: Path
-) -> None:
+def test_frames_whose_last_pixel_differs_replay_bit_for_bit(virtual_sensor: VirtualSensor, tmp_path: Path) -> None:
     """The runtime's own encoder swaps two bytes of such frames; ours does not."""
     drawn = np.random.default_rng(5).integers(500, 9000, 4)
     frames = np.full((4, 480, 640), 1200, np.uint16)
@@ -123,8 +121,7 @@ def test_so_long_as_asked(virtual_sensor: VirtualSensor, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("fault", "ended"),
-    [({"connected": 0}, "unplugged"), ({"stall": 1}, "no frame for 3 s"), ({"crash": 1}, "SIGSEGV")],
+    ("fault", "ended"), [({"connected": 0}, "unplugged"), ({"stall": 1}, "no frame for 3 s"), ({"crash": 1}, "SIGSEGV")]
 )
 def test_a_fault_of_the_sensor_ends_it_with_what_is_there(
     virtual_sensor: VirtualSensor, tmp_path: Path, fault: dict[str, int], ended: str
@@ -152,9 +149,7 @@ def test_a_file_that_cannot_grow_is_noticed(virtual_sensor: VirtualSensor, tmp_p
     noise = np.random.default_rng(0).integers(0, 9999, (4, 480, 640)).astype(np.uint16)
     noise.tofile(tmp_path / "noise.raw")
     virtual_sensor.set(frames=tmp_path / "noise.raw")
-    answer = subprocess.run(
-        [sys.executable, "-c", script, str(out)], capture_output=True, text=True, timeout=30
-    ).stdout
+    answer = subprocess.run([sys.executable, "-c", script, str(out)], capture_output=True, text=True, timeout=30).stdout
     ended, frames, problem = answer.strip().split("|")
     assert "cannot be written (File too large)" in ended
     assert int(frames) > 0 and "not whole" not in problem
@@ -255,9 +250,7 @@ def test_a_killed_program_leaves_a_whole_file(
         "record(sys.argv[1], progress=lambda frames: print(frames, flush=True))\n"
     )
     out = tmp_path / "out.oni"
-    with subprocess.Popen(
-        [sys.executable, "-c", script, str(out)], stdout=subprocess.PIPE, text=True
-    ) as program:
+    with subprocess.Popen([sys.executable, "-c", script, str(out)], stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
         while int(program.stdout.readline()) < 5:
             pass

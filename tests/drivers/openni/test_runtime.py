@@ -20,9 +20,7 @@ def _no_chosen_runtime(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("variable", ["OPENNI2_REDIST", "OPENNI2_REDIST64"])
 @pytest.mark.parametrize("name", ["libOpenNI2.so", "libOpenNI2.so.0"])
-def test_a_chosen_runtime_is_the_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variable: str, name: str
-) -> None:
+def test_a_chosen_runtime_is_the_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variable: str, name: str) -> None:
     monkeypatch.setattr(sys, "platform", "linux")
     (tmp_path / name).touch()
     drivers = tmp_path / "OpenNI2" / "Drivers"
@@ -35,9 +33,7 @@ def test_a_chosen_runtime_is_the_one(
     assert runtime.drivers == ("FreenectDriver", "PS1080")
 
 
-def test_a_chosen_folder_without_runtime_is_not_passed_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_chosen_folder_without_runtime_is_not_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENNI2_REDIST", str(tmp_path))
     with pytest.raises(RuntimeMissingError, match=f"OPENNI2_REDIST names {tmp_path}"):
         find_runtime()
@@ -51,9 +47,7 @@ def test_a_chosen_folder_without_runtime_is_not_passed_over(
         ("win32", "OpenNI2.dll", "OpenNI 2.2 SDK"),
     ],
 )
-def test_each_system_has_its_remedy(
-    monkeypatch: pytest.MonkeyPatch, system: str, library: str, remedy: str
-) -> None:
+def test_each_system_has_its_remedy(monkeypatch: pytest.MonkeyPatch, system: str, library: str, remedy: str) -> None:
     monkeypatch.setattr(sys, "platform", system)
     monkeypatch.setenv("ProgramFiles", "C:/Program Files")
     monkeypatch.setattr(Path, "is_file", lambda _: False)
@@ -66,12 +60,7 @@ def test_each_system_has_its_remedy(
 def plug_in(root: Path, port: str, vendor: str, product: str, device: int) -> Path:
     folder = root / "sys" / port
     folder.mkdir(parents=True)
-    for name, value in (
-        ("idVendor", vendor),
-        ("idProduct", product),
-        ("busnum", "1"),
-        ("devnum", str(device)),
-    ):
+    for name, value in (("idVendor", vendor), ("idProduct", product), ("busnum", "1"), ("devnum", str(device))):
         (folder / name).write_text(value + "\n")
     (root / "sys" / f"{port}:1.0").mkdir()  # an interface has no numbers of its own
     node = root / "dev" / "001" / f"{device:03}"

@@ -107,8 +107,4 @@ def test_a_lost_sensor_that_is_there_again_is_reconnecting(play: Callable[..., O
     device = play((*OPENS, frame(1), LOST), (look, FOUND, look, OPENED, frame(1), look))
     with device:
         wait_until(lambda: len(seen) == 3)
-    assert seen == [
-        ("lost", "it was unplugged or lost its power"),
-        ("reconnecting", "it is there again"),
-        ("live", ""),
-    ]
+    assert seen == [("lost", "it was unplugged or lost its power"), ("reconnecting", "it is there again"), ("live", "")]

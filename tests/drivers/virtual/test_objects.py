@@ -16,12 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from selective_depth.drivers.errors import (
-    DamagedRecordingError,
-    SourceEndedError,
-    SourceError,
-    SourceNotFoundError,
-)
+from selective_depth.drivers.errors import DamagedRecordingError, SourceEndedError, SourceError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.virtual.objects import OBJECT_MM, SIDES, MeshSource, place, render
@@ -66,9 +61,7 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "object.ply"
 
 
-POINTS = arrays.arrays(
-    np.float64, st.tuples(st.integers(1, 12), st.just(3)), elements=st.floats(-1e6, 1e6, width=32)
-)
+POINTS = arrays.arrays(np.float64, st.tuples(st.integers(1, 12), st.just(3)), elements=st.floats(-1e6, 1e6, width=32))
 
 
 @settings(max_examples=150, deadline=None)
@@ -257,9 +250,7 @@ def slow_render(points, triangles, camera) -> npt.NDArray[np.float64]:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    points=arrays.arrays(
-        np.float64, (6, 3), elements=st.floats(-1, 1, allow_nan=False, allow_subnormal=False)
-    ),
+    points=arrays.arrays(np.float64, (6, 3), elements=st.floats(-1, 1, allow_nan=False, allow_subnormal=False)),
     triangles=arrays.arrays(np.int32, (4, 3), elements=st.integers(0, 5)),
     side=st.sampled_from(sorted(SIDES)),
 )

@@ -18,16 +18,7 @@ from selective_depth.drivers.open import open_source
 from selective_depth.drivers.virtual import noise as kinect_noise
 from selective_depth.drivers.virtual import source as virtual
 from selective_depth.drivers.virtual.noise import depth_steps, kinect_depth
-from selective_depth.drivers.virtual.renderer import (
-    CYLINDER,
-    DISC,
-    NEAREST_MM,
-    QUAD,
-    SPHERE,
-    TORUS,
-    Shapes,
-    cast,
-)
+from selective_depth.drivers.virtual.renderer import CYLINDER, DISC, NEAREST_MM, QUAD, SPHERE, TORUS, Shapes, cast
 from selective_depth.drivers.virtual.scenes import SCENES
 from selective_depth.drivers.virtual.source import VirtualSource, camera_pose
 
