@@ -6,9 +6,9 @@ import json
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,18 +17,23 @@ from rich.table import Table
 
 from selective_depth.app.console.command import colours
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.output import write_output
+from selective_depth.app.console.output import check_output, check_picture, write_output
 from selective_depth.app.console.progress import FrameProgress
 from selective_depth.app.evaluation.evaluate import ENDLESS_FRAMES
+from selective_depth.app.pictures import sheet, write_picture
+from selective_depth.app.pictures.panels import depth_panel, error_panel
 from selective_depth.app.pipeline import say
 from selective_depth.app.settings import ComparisonOptions, EvaluationFiles, Settings
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
 from selective_depth.selectors.acquire import acquire
-from selective_depth.selectors.memory import TemporalAcquisition
+from selective_depth.selectors.memory import TemporalAcquisition, TemporalStep
 from selective_depth.selectors.memory.store import KEPT
 from selective_depth.selectors.seeds import SeedGrid
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FIRST_BUDGET = 0.05
 """Beyond the seeds: of a first frame with memory, and of every frame without."""
@@ -85,7 +90,7 @@ def over_time(
     frames: int | None = None,
     seeds_shape: tuple[int, int] = (128, 128),
     rounds: int = 8,
-    progress: Callable[[int], None] = lambda done: None,
+    each: Callable[[DepthFrame, TemporalStep], None] = lambda frame, step: None,
 ) -> dict[str, Course]:
     """Follow a source with memory and without it.
 
@@ -102,8 +107,8 @@ def over_time(
         Rows and columns of the seed lattice.
     rounds : int, default 8
         Rounds of the acquisition without memory, and of a first frame with it.
-    progress : callable, optional
-        Called with the number of frames done.
+    each : callable, optional
+        Called with every frame and what the memory came to.
 
     Returns
     -------
@@ -122,7 +127,7 @@ def over_time(
     courses = {way: Course() for way in WAYS}
     memory: TemporalAcquisition | None = None
     last: deque[npt.NDArray[np.float32]] = deque(maxlen=KEPT)
-    for done, frame in enumerate(_frames(uri, frames)):
+    for frame in _frames(uri, frames):
         truth = _truth(frame)
         scored = truth > 0
         scored &= (frame.depth_mm > 0) if often is None else often
@@ -138,7 +143,7 @@ def over_time(
         courses["whole_frame"].add(frame.depth_mm, truth, scored)
         last.append(np.where(frame.depth_mm > 0, frame.depth_mm, np.float32(np.nan)))
         courses["median"].add(_median(last), truth, scored)
-        progress(done + 1)
+        each(frame, step)
     if memory is None:
         raise SourceNotFoundError(f"'{uri}' has no frame; give another source.")
     return courses
@@ -170,18 +175,29 @@ def run_over_time(
         raise UsageError("no source was named; give recordings, folders or scenes.")
     if not options.budget:
         raise UsageError("--budget names no share; give one, such as 2%.")
+    check_picture(files.picture)
+    check_output(files.json)
     found: dict[str, dict[str, Course]] = {}
+    last: list[tuple[DepthFrame, TemporalStep]] = []
     for uri in sources:
         with FrameProgress(f"Following {uri}", options.frames) as bar:
+
+            def each(frame: DepthFrame, step: TemporalStep, bar: FrameProgress = bar) -> None:
+                bar.update(step.frame + 1)
+                last[:] = [(frame, step)]
+
             found[uri] = over_time(
                 uri,
                 float(options.budget[0]),
                 frames=options.frames,
                 seeds_shape=(settings.seeds.rows, settings.seeds.columns),
                 rounds=options.rounds,
-                progress=bar.update,
+                each=each,
             )
         _print(uri, found[uri], float(options.budget[0]))
+        if files.picture is not None and len(found) == 1:
+            write_picture(files.picture, _picture(*last[0]))
+            say(f"wrote {files.picture}")
     if files.json is not None:
         document = {
             "over_time": {uri: {way: asdict(course) for way, course in ways.items()} for uri, ways in found.items()},
@@ -189,6 +205,17 @@ def run_over_time(
         }
         write_output(files.json, json.dumps(document, indent=1) + "\n")
         say(f"wrote {files.json}")
+
+
+def _picture(frame: DepthFrame, step: TemporalStep) -> Figure:
+    """The truth, the sensor's whole frame and the memory's model, and how wrong both are."""
+    exact = replace(frame, depth_mm=_truth(frame))
+    remembered = replace(frame, depth_mm=np.clip(np.rint(step.model_mm), 0, 65535).astype(np.uint16))
+    first = [depth_panel(exact, "Truth"), depth_panel(frame, "One whole frame"), depth_panel(remembered, "Memory")]
+    seen = replace(exact, depth_mm=np.where(frame.depth_mm > 0, exact.depth_mm, 0).astype(np.uint16))
+    errors = [error_panel(seen, shown.depth_mm.astype(np.float32), "Its error") for shown in (frame, remembered)]
+    share = f"{100 * len(step.uv) / frame.depth_mm.size:.3g} % of the pixels a frame"
+    return sheet([(f"Frame {step.frame}: memory from {share}", first), ("", [None, *errors])], legend=False)
 
 
 def _print(uri: str, ways: dict[str, Course], budget: float) -> None:

@@ -19,6 +19,7 @@ from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, MISUSED, OK
 from selective_depth.app.evaluation import evaluate as protocol
 from selective_depth.app.evaluation.evaluate import Errors, Outcome, outcomes, summarise
+from selective_depth.app.evaluation.over_time import over_time
 from selective_depth.app.evaluation.quadtree import quadtree
 from selective_depth.app.evaluation.report import comparison, print_results, to_markdown
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of
@@ -446,3 +447,28 @@ def test_strategies_are_named_by_groups_or_one_by_one() -> None:
     assert {"neural-gas/one-shot", "neural-gas/loop", "gradient/loop"} <= set(every)
     with pytest.raises(UsageError, match="'nope'; it takes main, all, FILE"):
         strategies_of(["nope"])
+
+
+def test_over_time_a_memory_is_held_against_what_it_replaces(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, picture = tmp_path / "out.json", tmp_path / "memory.png"
+    uri = "virtual:ball?speed=0&frames=6&size=160x120"
+    words = ["evaluate", uri, "--over-time", "--budget", "5%", "--json", str(out), "--picture", str(picture)]
+    assert run([*words, "--seeds.rows", "32", "--seeds.columns", "32", "--rounds", "4"]) == OK
+    found = json.loads(out.read_text())["over_time"][uri]
+    assert set(found) == {"memory", "memoryless", "whole_frame", "median"}
+    for course in found.values():
+        assert len(course["rmse_mm"]) == len(course["mae_mm"]) == 6
+    assert found["memory"]["rmse_mm"][0] == pytest.approx(found["memoryless"]["rmse_mm"][0])
+    assert found["memory"]["mae_mm"][-1] < 0.8 * found["memoryless"]["mae_mm"][-1]
+    assert found["median"]["rmse_mm"][-1] < found["whole_frame"]["rmse_mm"][-1]
+    assert cv2.imread(str(picture)) is not None
+    assert "memoryless" in capsys.readouterr().out
+    assert run(["evaluate", "--over-time"]) == MISUSED
+
+
+def test_over_time_a_recording_without_truth_is_held_against_itself(folder: Path) -> None:
+    courses = over_time(str(folder), 0.05, seeds_shape=SHAPE, rounds=2)
+    assert courses["whole_frame"].rmse_mm == [0, 0, 0]
+    assert all(value > 0 for value in courses["memory"].rmse_mm)
