@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from selective_depth.drivers.errors import SourceNotFoundError
@@ -112,15 +113,15 @@ class Options:
             raise self._refuse(name, value, words)
         return word, int(number)
 
-    def numbers(self, name: str, what: str, low: float, high: float) -> tuple[float, ...] | None:
-        """Numbers from `low` to `high`, as many as `what` names, commas between; None if absent."""
-        count = what.count(",") + 1
+    def numbers(self, name: str, what: str, low: float, high: float, between: str = ",") -> tuple[float, ...] | None:
+        """Numbers from `low` to `high`, as many as `what` names; None if absent."""
+        count = len(re.split(between, what))
         allowed = f"{what}, {'each ' * (count > 1)}a number from {low:g} to {high:g}"
         value = self._take(name, allowed)
         if value is None:
             return None
         try:
-            numbers = tuple(float(word) for word in value.split(","))
+            numbers = tuple(float(word) for word in re.split(between, value))
         except ValueError:
             raise self._refuse(name, value, allowed) from None
         if len(numbers) != count or not all(low <= number <= high for number in numbers):

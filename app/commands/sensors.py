@@ -12,8 +12,8 @@ from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pipeline import say
-from selective_depth.drivers.openni import list_devices, runtime_version
 from selective_depth.drivers.openni import record as record_oni
+from selective_depth.drivers.openni import survey
 from selective_depth.drivers.openni.runtime import find_runtime
 from selective_depth.drivers.openni.usb import usb_advice
 
@@ -33,9 +33,11 @@ def print_devices() -> int:
     """
     runtime = find_runtime()
     with waiting("Asking OpenNI2 for its sensors"):
-        found = list_devices()
-    say(f"OpenNI2 {runtime_version()}, {runtime.path}")
+        found, version = survey()
+    say(f"OpenNI2 {version}, {runtime.path}")
     say(f"drivers: {', '.join(runtime.drivers) or 'none'}")
+    for file in runtime.not_loaded:
+        say(f"not loaded: {file}; the runtime loads {runtime.pattern} only. Copy it to such a name.")
     if not found:
         say(f"no sensor found. {usb_advice(runtime.drivers) or UNKNOWN_ADVICE}")
         return FAILED

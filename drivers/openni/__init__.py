@@ -6,7 +6,7 @@ becomes a named error here, and frames already delivered stay good.
 
 from selective_depth.drivers.openni.device import DeviceSettings, OpenNIDevice
 from selective_depth.drivers.openni.recorder import RecordingReport, record
-from selective_depth.drivers.openni.sensors import DeviceInfo, list_devices, runtime_version
+from selective_depth.drivers.openni.sensors import DeviceInfo, list_devices, runtime_version, survey
 
 __all__ = [
     "DeviceInfo",
@@ -16,4 +16,5 @@ __all__ = [
     "list_devices",
     "record",
     "runtime_version",
+    "survey",
 ]

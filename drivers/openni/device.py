@@ -16,6 +16,7 @@ from selective_depth.drivers.errors import (
     SourceTimeoutError,
 )
 from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.oni.form import upright
 from selective_depth.drivers.openni.process import Message, Worker, camera_of, error_of
 from selective_depth.drivers.openni.sensors import DeviceInfo
 from selective_depth.drivers.source import DepthSource
@@ -27,6 +28,10 @@ _RESTART_S = 3.0  # silence after which it is opened afresh
 _HANG_S = 2.0  # the worker says something every 0.2 s; beyond this it hangs
 _MISFITS = 15  # so many wrong frames in a row, and the sensor is set up afresh
 _BACK_OFF_S = (0.2, 0.4, 0.8, 1.5)  # pauses between attempts, the last one for ever
+_NO_FRAMES = (
+    " Plug it into a port of its own, not a hub, away from other cameras (a bus has room for one);"
+    " check its power supply; in a virtual machine, hand on the whole USB controller."
+)
 _GRACE_S = 1.0  # for a worker to stop the sensor before it is killed
 _BEAT_S = 0.1  # how soon the supervisor notices that it should end
 
@@ -43,6 +48,8 @@ class DeviceSettings:
         Its frame rate.
     mirror : bool, default False
         Deliver the image as in a mirror.
+    nearest : bool, default False
+        Where it has no such mode, take the one that is nearest to it.
     registration : bool, default False
         Depth registered to the sensor's colour camera, where it can.
     first_frame_s : float, default 10
@@ -53,6 +60,7 @@ class DeviceSettings:
     height: int = 480
     fps: int = 30
     mirror: bool = False
+    nearest: bool = False
     registration: bool = False
     first_frame_s: float = 10.0
 
@@ -67,6 +75,7 @@ class _Count:
         self._add_number = 0
         self._add_us = 0
         self._fresh = True
+        self.mended = 0
 
     def restart(self) -> None:
         """The next frame is the first of another run of the sensor."""
@@ -79,11 +88,14 @@ class _Count:
         renumbered = self._fresh or index + self._add_number <= self._number
         if renumbered:
             self._add_number = self._number + 1 - index
-        turned_back = renumbered and timestamp_us + self._add_us <= self._timestamp_us
-        if self._number >= 0 and (self._fresh or turned_back):
-            # The outage takes as long on our clock as it took on the wall.
-            away_us = round((now - self._seen_s) * 1e6)
-            self._add_us = self._timestamp_us + max(away_us, 1) - timestamp_us
+        # The outage takes as long on our clock as it took on the wall.
+        away_us = max(round((now - self._seen_s) * 1e6), 1)
+        step_us = timestamp_us + self._add_us - self._timestamp_us
+        # A clock that stands, wraps round or counts milliseconds.
+        wrong = step_us <= 0 or (away_us < 500_000 and step_us * 50 < away_us)
+        if self._number >= 0 and (self._fresh or wrong):
+            self.mended += not self._fresh
+            self._add_us = self._timestamp_us + away_us - timestamp_us
         self._fresh = False
         self._seen_s = now
         self._number = index + self._add_number
@@ -115,6 +127,9 @@ class OpenNIDevice(DepthSource):
     tap : callable, optional
         Gets every frame that the sensor made, on the thread that takes them in, whether it is read
         or not: `OniRecorder.write`. It must be quick.
+
+    intrinsics : (float, float, float, float), optional
+        fx, fy, cx, cy in pixels; default from the field of view that the driver states.
 
     Attributes
     ----------
@@ -149,9 +164,10 @@ class OpenNIDevice(DepthSource):
         settings: DeviceSettings | None = None,
         *,
         tap: Callable[[DepthFrame], None] | None = None,
+        intrinsics: tuple[float, ...] | None = None,
     ) -> None:
         self.uri = f"openni:{device_uri}" if device_uri else "openni"
-        self.settings = settings or DeviceSettings()
+        self.settings = settings or DeviceSettings(nearest=True)
         self.dropped = 0
         self.restarts = 0
         self.misfits = 0
@@ -170,11 +186,19 @@ class OpenNIDevice(DepthSource):
         started = time.monotonic()
         self._worker, about = self._open(_OPEN_S, None)
         self._reopen_s = max(_REOPEN_S, 2 * (time.monotonic() - started))
-        camera = camera_of(about)
+        camera, notes = camera_of(about, intrinsics)
         if self.settings.mirror:
             camera = replace(camera, cx=camera.width - 1 - camera.cx)
         self.camera = camera
         self.fps = float(about["fps"])
+        self._tenths = bool(about["tenths"])
+        wanted = (self.settings.width, self.settings.height, self.settings.fps)
+        taken = (camera.width, camera.height, int(about["fps"]))
+        if taken != wanted:
+            text = "it has no {}x{}@{}; {}x{}@{} is taken, and --mode takes another"
+            notes += (text.format(*wanted, *taken),)
+        self.notes = tuple(f"{self.uri}: {note}." for note in notes)
+        self._doubt_identity(about)
         self._supervisor = threading.Thread(target=self._supervise, name="openni-supervisor", daemon=True)
         self._supervisor.start()
 
@@ -233,6 +257,14 @@ class OpenNIDevice(DepthSource):
             )
         advice = " Check its cable and its power supply." if self.state == "stalled" else ""
         return SourceTimeoutError(f"The sensor {self.uri} gave no frame within {timeout_s:g} s.{advice}")
+
+    def _doubt_identity(self, about: Message) -> None:
+        note = (
+            f"{self.uri}: there are several of its kind and its driver gives no serial number; once"
+            " one is plugged in again, it cannot be known which it is."
+        )
+        if about["twins"] and not self.device.serial and note not in self.notes:
+            self.notes += (note,)
 
     def _become(self, state: str, why: str = "") -> None:
         with self._changed:
@@ -308,6 +340,10 @@ class OpenNIDevice(DepthSource):
                     return "reconnecting", why
             elif message["kind"] == "idle":
                 if message["silent_s"] > silence_s:
+                    if self._first is None:
+                        raise DeviceRefusedError(
+                            f"The sensor {self.uri} opens, but sent no frame for {silence_s:g} s." + _NO_FRAMES
+                        )
                     return "reconnecting", f"no frame for {silence_s:g} s"
                 if message["silent_s"] > _STALL_S:
                     self._become("stalled", "it sends no frames")
@@ -320,11 +356,16 @@ class OpenNIDevice(DepthSource):
         return "lost", "closed"
 
     def _arrive(self, message: Message) -> None:
-        depth_mm = self._worker.take(message, self.camera.width, self.camera.height)
-        if self.settings.mirror:
-            depth_mm = depth_mm[:, ::-1].copy()
+        stored = self._worker.take(message, self.camera.width, self.camera.height)
+        depth_mm = upright(stored, self._tenths, self.settings.mirror)
         depth_mm.flags.writeable = False  # handed over: the frame need not copy it
+        said = self._count.mended
         number, timestamp_us = self._count.follow(message)
+        if self._count.mended > said == 0:
+            self.notes += (
+                f"{self.uri}: its clock stands, jumps back or does not count microseconds; this"
+                " computer's tells the times instead.",
+            )
         if self._first is None:
             self._first = number
         frame = DepthFrame(depth_mm, number - self._first, timestamp_us, self.camera, self.uri)
@@ -341,7 +382,8 @@ class OpenNIDevice(DepthSource):
         while not self._closing.wait(_BACK_OFF_S[min(self._attempts, len(_BACK_OFF_S) - 1)]):
             self._attempts += 1
             try:
-                self._worker, _ = self._open(self._reopen_s, self.device)
+                self._worker, about = self._open(self._reopen_s, self.device)
+                self._doubt_identity(about)
             except SourceNotFoundError as error:
                 self._become("lost", str(error).rstrip("."))
             except SourceError as error:

@@ -107,9 +107,17 @@ class Slots:
         except queue.Empty:
             return None
 
-    def fill(self, slot: int, address: int, size: int) -> None:
-        """Copy an image from the runtime's memory, which it will use again."""
-        ctypes.memmove(self._start + slot * self._slot_bytes, address, size)
+    def fill(self, slot: int, address: int, row: int, stride: int, rows: int) -> None:
+        """Copy an image from the runtime's memory, which it will use again.
+
+        Of each `stride` bytes there, the first `row` are pixels.
+        """
+        start = self._start + slot * self._slot_bytes
+        if row == stride:
+            ctypes.memmove(start, address, row * rows)
+        else:
+            for number in range(rows):
+                ctypes.memmove(start + number * row, address + number * stride, row)
 
     def fits(self, size: int) -> bool:
         """Whether an image of so many bytes has room."""

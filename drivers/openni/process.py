@@ -40,13 +40,25 @@ def error_of(message: Message) -> SourceError:
     return _ERRORS[message["error"]](text)
 
 
-def camera_of(stream: Message) -> Camera:
-    """Intrinsics of a stream from its fields of view; a Kinect's where it does not know them."""
+def camera_of(stream: Message, given: tuple[float, ...] | None = None) -> tuple[Camera, tuple[str, ...]]:
+    """Intrinsics of a stream from its fields of view, and what is doubtful about them."""
     size = int(stream["width"]), int(stream["height"])
-    fov_rad = float(stream["fov_x_rad"]), float(stream["fov_y_rad"])
-    if all(0 < angle < math.pi for angle in fov_rad):
-        return Camera.from_fov(*size, *fov_rad)
-    return Camera.kinect(*size)
+    if given is not None:
+        return Camera(*size, *given), ()
+    angles = float(stream["fov_x_rad"]), float(stream["fov_y_rad"])
+    advice = "; give --camera fx,fy,cx,cy if you know them"
+    if all(math.pi < angle < 180 for angle in angles):
+        camera = Camera.from_fov(*size, *map(math.radians, angles))
+        return camera, (f"its driver states its field of view in degrees, which is read so{advice}",)
+    if not all(0 < angle < math.pi for angle in angles):
+        return Camera.kinect(*size), (f"its driver states no field of view: a Kinect's intrinsics are assumed{advice}",)
+    camera = Camera.from_fov(*size, *angles)
+    if abs(camera.fx / camera.fy - 1) > 0.1:
+        return camera, (
+            f"its field of view does not suit images of {size[0]}x{size[1]} pixels (fx"
+            f" {camera.fx:.0f}, fy {camera.fy:.0f}): it may be another camera's{advice}",
+        )
+    return camera, ()
 
 
 class Worker:

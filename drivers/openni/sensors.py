@@ -22,6 +22,8 @@ class DeviceInfo:
         What its driver calls it.
     usb_vendor_id, usb_product_id : int
         Its numbers on the USB bus; 0 where there is no bus.
+    serial : str
+        Its serial number, known once it is open; empty where the driver gives none.
     """
 
     uri: str
@@ -29,6 +31,7 @@ class DeviceInfo:
     name: str
     usb_vendor_id: int
     usb_product_id: int
+    serial: str = ""
 
 
 def list_devices() -> list[DeviceInfo]:
@@ -39,7 +42,13 @@ def list_devices() -> list[DeviceInfo]:
     RuntimeMissingError
         If OpenNI2 is not installed or does not start.
     """
-    return [DeviceInfo(**device) for device in _ask()["devices"]]
+    return survey()[0]
+
+
+def survey() -> tuple[list[DeviceInfo], str]:
+    """As `list_devices`, with the version of the runtime; asked at once, none of them is opened."""
+    answer = _ask()
+    return [DeviceInfo(**device) for device in answer["devices"]], str(answer["version"])
 
 
 def runtime_version() -> str:
@@ -50,7 +59,7 @@ def runtime_version() -> str:
     RuntimeMissingError
         If OpenNI2 is not installed or does not start.
     """
-    return str(_ask()["version"])
+    return survey()[1]
 
 
 def _ask() -> Message:

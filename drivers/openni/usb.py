@@ -8,6 +8,7 @@ from pathlib import Path
 
 _KINECT_CAMERA = (0x045E, 0x02AE)
 _KINECT_MOTORS = ((0x045E, 0x02B0), (0x045E, 0x02C2))
+_ORBBEC = 0x2BC5
 _NAMES = {
     _KINECT_CAMERA: "Kinect for Xbox 360",
     (0x045E, 0x02BF): "Kinect for Windows",
@@ -16,11 +17,13 @@ _NAMES = {
     (0x1D27, 0x0600): "PrimeSense sensor",  # as built into the ASUS Xtion, too
     (0x1D27, 0x0601): "PrimeSense sensor",
     (0x1D27, 0x0609): "PrimeSense sensor",
+    (_ORBBEC, 0): "Orbbec sensor",  # of which there are dozens
 }
 _DRIVERS = {  # OpenNI2's driver for it, and where it comes from
     "Kinect for Xbox 360": ("FreenectDriver", "build libfreenect's, as the README says"),
     "Kinect for Windows": ("FreenectDriver", "build libfreenect's, as the README says"),
     "Kinect for Xbox One": ("freenect2", "build libfreenect2's"),
+    "Orbbec sensor": ("orbbec", "copy liborbbec.so of Orbbec's OpenNI2 SDK beside the others"),
     "PrimeSense sensor": ("PS1080", "install the runtime again"),
 }
 
@@ -70,5 +73,5 @@ def _devices(bus: Path, nodes: Path) -> dict[tuple[int, int], Path]:
             place = [int((device / name).read_text()) for name in ("busnum", "devnum")]
         except (OSError, ValueError):
             continue  # an interface, or it was pulled out just now
-        found[vendor, product] = nodes / f"{place[0]:03}" / f"{place[1]:03}"
+        found[vendor, product if vendor != _ORBBEC else 0] = nodes / f"{place[0]:03}" / f"{place[1]:03}"
     return found

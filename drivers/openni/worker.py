@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import ctypes
 import os
+import shlex
 import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +31,7 @@ else:  # a script finds what lies beside it only if told; last, to stand in noth
 WAIT_S = 0.2  # longest uninterrupted wait for a frame, and the beat of "idle" messages
 SETTLE_S = 0.05  # between stop and close: the runtime's threads set their flags late
 MILLIMETRES = int(openni2.PIXEL_FORMAT_DEPTH_1_MM)
+UNITS = {MILLIMETRES: "mm", 101: "0.1 mm"}
 
 
 class Device(openni2.Device):  # type: ignore[misc]
@@ -95,16 +98,21 @@ def devices() -> list[dict[str, Any]]:
     return found
 
 
-def choose(found: list[dict[str, Any]], wanted: str, like: dict[str, Any] | None) -> dict[str, Any]:
-    """The device to open: the one named, the only one, or one like the one that was lost."""
+def choose(found: list[dict[str, Any]], wanted: str, like: dict[str, Any] | None) -> list[dict[str, Any]]:
+    """Devices that may be the one to open: the one named, the only one, those of a lost one's kind.
+
+    Addresses of one device that differ after a '?' (libfreenect2 has three) count as one.
+    """
     named = [device for device in found if device["uri"] == wanted]
-    if named:
-        return named[0]
+    if named and like is None:
+        return named
+    bases = [device["uri"].partition("?")[0] for device in found]
+    found = [device for at, device in enumerate(found) if bases.index(bases[at]) == at]
     if like is not None:
         # Plugged in again, a USB sensor comes back under another address.
         kind = like["vendor"], like["name"]
-        found = [device for device in found if (device["vendor"], device["name"]) == kind]
-        wanted = ""
+        others = [d for d in found if (d["vendor"], d["name"]) == kind and d not in named]
+        found, wanted = [*named, *others], ""
     uris = ", ".join(device["uri"] for device in found) or "none"
     if wanted:
         raise JobError("SourceNotFoundError", f"There is no sensor '{wanted}'. Connected: {uris}.")
@@ -112,13 +120,14 @@ def choose(found: list[dict[str, Any]], wanted: str, like: dict[str, Any] | None
         raise JobError(
             "SourceNotFoundError", "OpenNI2 finds no depth sensor.", "Plug one in; a Kinect needs its power supply too."
         )
-    if len(found) > 1:
+    # Of several of a kind a serial number tells the right one; without, only its own address.
+    if len(found) > 1 and not (like and (like["serial"] or named)):
         raise JobError(
             "SourceNotFoundError",
             f"{len(found)} sensors are connected: {uris}. Name one of them, as in"
-            f" `selective-depth live {found[0]['uri']}`.",
+            f" `selective-depth live {shlex.quote(found[0]['uri'])}`.",
         )
-    return found[0]
+    return found if like and like["serial"] else found[:1]
 
 
 def mode_key(mode: Any) -> tuple[int, int, int, int]:
@@ -126,10 +135,16 @@ def mode_key(mode: Any) -> tuple[int, int, int, int]:
     return mode.resolutionX, mode.resolutionY, mode.fps, int(mode.pixelFormat)
 
 
+def _distance(mode: tuple[int, ...], wanted: tuple[int, ...]) -> tuple[float, ...]:
+    """How far a mode is from the wanted one: size, then unit, then rate."""
+    sizes = abs(mode[0] * mode[1] - wanted[0] * wanted[1]) + abs(mode[0] - wanted[0])
+    return sizes, abs(mode[3] - wanted[3]), abs(mode[2] - wanted[2])
+
+
 def mode_text(mode: Any) -> str:
     """A video mode for people; the library's own `repr` raises."""
     width, height, fps, pixels = mode_key(mode)
-    unit = {MILLIMETRES: "mm", 101: "0.1 mm"}.get(pixels, f"pixel format {pixels}")
+    unit = UNITS.get(pixels, f"pixel format {pixels}")
     return f"{width}x{height} at {fps} fps in {unit}"
 
 
@@ -151,18 +166,25 @@ class LiveStream:
     """A live device's depth stream, with every setting applied and checked."""
 
     def __init__(self, job: dict[str, Any], parent: Parent) -> None:
-        self.info = choose(devices(), job["uri"], job["like"])
-        parent.send("found", device=self.info)
-        uri = self.info["uri"]
-        self.watch = Watch(uri)
-        try:
-            self.device = Device(uri.encode())
-        except OpenNIError as error:
+        like, there = job["like"], devices()
+        for info in choose(there, job["uri"], like):
+            self.info = info
+            parent.send("found", device=info)
+            self.watch = Watch(info["uri"])
+            self._open()
+            info["serial"] = self._serial()
+            if not (like and like["serial"]) or info["serial"] == like["serial"]:
+                break
+            self.device.close()
+        else:
             raise JobError(
-                "DeviceRefusedError",
-                f"The sensor {uri} is there but cannot be opened: {reason(error)}.",
-                "Close the program that uses it, or pull it out and plug it in again.",
-            ) from error
+                "SourceNotFoundError", f"Of the sensors that are there, none has the serial number {like['serial']}."
+            )
+        parent.send("found", device=info)
+        kind = info["vendor"], info["name"]
+        same = [each["uri"] for each in there if (each["vendor"], each["name"]) == kind]
+        self.twins = len({address.partition("?")[0] for address in same}) > 1
+        uri = info["uri"]
         if not self.device.has_sensor(openni2.SENSOR_DEPTH):
             raise JobError("DeviceRefusedError", f"The sensor {uri} has no depth camera.")
         try:
@@ -174,37 +196,65 @@ class LiveStream:
                 f"The sensor {uri} refuses a depth stream: {reason(error)}. Pull it out and plug it in again.",
             ) from error
 
+    def _open(self) -> None:
+        uri = self.info["uri"]
+        try:
+            self.device = Device(uri.encode())
+        except OpenNIError as error:
+            raise JobError(
+                "DeviceRefusedError",
+                f"The sensor {uri} is there but cannot be opened: {reason(error)}.",
+                "Close the program that uses it, or pull it out and plug it in again.",
+            ) from error
+
+    def _serial(self) -> str:
+        """Its serial number; empty where the driver does not give it."""
+        key = c_api.ONI_DEVICE_PROPERTY_SERIAL_NUMBER
+        with suppress(OpenNIError):
+            if self.device.is_property_supported(key):
+                text = self.device.get_property(key, ctypes.c_char * 128)
+                return str(text.value.decode(errors="replace"))
+        return ""
+
     def _configure(self, settings: dict[str, Any]) -> None:
         """Set what is not yet as wanted, and nothing else: drivers refuse the odd setting."""
         stream = self.stream
         uri = self.info["uri"]
         wanted = (settings["width"], settings["height"], settings["fps"], MILLIMETRES)
-        modes = self.device.get_sensor_info(openni2.SENSOR_DEPTH).videoModes
-        mode = next((mode for mode in modes if mode_key(mode) == wanted), None)
-        if mode is None:
+        modes = list(self.device.get_sensor_info(openni2.SENSOR_DEPTH).videoModes)
+        usable = [mode for mode in modes if mode_key(mode)[3] in UNITS]
+        usable.sort(key=lambda mode: _distance(mode_key(mode), wanted))
+        mode = usable[0] if usable else None
+        if mode is None or not (settings["nearest"] or mode_key(mode)[:3] == wanted[:3]):
             raise JobError(
                 "DeviceRefusedError",
                 f"The sensor {uri} cannot give {wanted[0]}x{wanted[1]} at {wanted[2]} fps in mm."
                 f" It offers: {'; '.join(map(mode_text, modes))}.",
             )
-        if stream.is_cropping_supported() and stream.get_cropping().enabled:
-            stream.reset_cropping()
-        if mode_key(stream.get_video_mode()) != wanted:
+        # What a driver does not tell of, or fails to tell, is left as it is.
+        with suppress(OpenNIError):
+            if stream.is_cropping_supported() and stream.get_cropping().enabled:
+                stream.reset_cropping()
+        if mode_key(stream.get_video_mode()) != mode_key(mode):
             stream.set_video_mode(mode)
-        mirrored = stream.is_property_supported(c_api.ONI_STREAM_PROPERTY_MIRRORING)
-        if mirrored and stream.get_mirroring_enabled():
-            # Mirroring, where wanted, is the parent's: libfreenect's writes out of bounds.
-            stream.set_mirroring_enabled(False)
+        with suppress(OpenNIError):
+            mirrored = stream.is_property_supported(c_api.ONI_STREAM_PROPERTY_MIRRORING)
+            if mirrored and stream.get_mirroring_enabled():
+                # Mirroring, where wanted, is the parent's: libfreenect's writes out of bounds.
+                stream.set_mirroring_enabled(False)
         self._register(settings["registration"])
 
     def _register(self, wanted: bool) -> None:
         device = self.device
         mode = openni2.IMAGE_REGISTRATION_DEPTH_TO_COLOR if wanted else openni2.IMAGE_REGISTRATION_OFF
-        known = device.is_property_supported(c_api.ONI_DEVICE_PROPERTY_IMAGE_REGISTRATION)
-        if known and device.is_image_registration_mode_supported(mode):
-            if device.get_image_registration_mode() != mode:
+        known = False
+        with suppress(OpenNIError):
+            known = device.is_property_supported(
+                c_api.ONI_DEVICE_PROPERTY_IMAGE_REGISTRATION
+            ) and device.is_image_registration_mode_supported(mode)
+            if known and device.get_image_registration_mode() != mode:
                 device.set_image_registration_mode(mode)
-        elif wanted:
+        if wanted and not known:
             raise JobError(
                 "DeviceRefusedError", f"The sensor {self.info['uri']} cannot register depth to its colour camera."
             )
@@ -237,6 +287,7 @@ def describe(stream: Any) -> dict[str, Any]:
     except OpenNIError:
         fov_rad = (0.0, 0.0)  # not every driver knows it
     return {
+        "tenths": int(mode.pixelFormat) == 101,
         "width": mode.resolutionX,
         "height": mode.resolutionY,
         "fps": mode.fps,
@@ -252,13 +303,17 @@ def next_frame(stream: Any) -> Any | None:
     return stream.read_frame()
 
 
-def misfit(frame: Any, width: int, height: int) -> str:
-    """What is wrong with a frame's size or format; empty if nothing."""
-    expected = (width, height, width * 2, width * height * 2)
-    got = (frame.width, frame.height, frame.stride, frame.dataSize)
-    if got != expected:
-        return "it is {}x{} (stride {}, {} bytes), expected {}x{} (stride {}, {} bytes)".format(*got, *expected)
-    if int(frame.videoMode.pixelFormat) != MILLIMETRES:
+def misfit(frame: Any, about: dict[str, Any]) -> str:
+    """What is wrong with a frame's size or format; empty if nothing. Rows may be padded."""
+    width, height = about["width"], about["height"]
+    least = (height - 1) * frame.stride + width * 2
+    fits = frame.stride >= width * 2 and frame.dataSize >= least
+    if (frame.width, frame.height) != (width, height) or not fits:
+        got = (frame.width, frame.height, frame.stride, frame.dataSize)
+        return "it is {}x{} (stride {}, {} bytes), expected {}x{} (stride {}, {} bytes)".format(
+            *got, width, height, width * 2, width * height * 2
+        )
+    if int(frame.videoMode.pixelFormat) != (101 if about["tenths"] else MILLIMETRES):
         return f"it is {mode_text(frame.videoMode)}, expected depth in mm"
     return ""
 
@@ -279,7 +334,7 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
     live = LiveStream(job, parent)
     about = describe(live.stream)
     live.start()
-    parent.send("opened", **about)
+    parent.send("opened", twins=live.twins, **about)
     width, height = about["width"], about["height"]
     if not slots.fits(width * height * 2):
         raise JobError("DeviceRefusedError", f"Frames of {width}x{height} pixels are too large.")
@@ -289,14 +344,16 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
             parent.send("lost")
             break
         frame = next_frame(live.stream)
-        if frame is None:
+        if frame is None or frame.dataSize == 0:  # a transfer that carried nothing
             parent.send("idle", silent_s=time.monotonic() - last_frame)
+            if frame is not None:
+                frame.close()
             continue
         last_frame = time.monotonic()
-        problem = misfit(frame, width, height)
+        problem = misfit(frame, about)
         slot = None if problem else slots.take()
         if slot is not None:
-            slots.fill(slot, frame.data, frame.dataSize)
+            slots.fill(slot, frame.data, width * 2, frame.stride, height)
             parent.send("frame", slot=slot, index=frame.frameIndex, timestamp_us=frame.timestamp)
         elif problem:
             parent.send("misfit", problem=problem)

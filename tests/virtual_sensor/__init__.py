@@ -16,6 +16,17 @@ limit              -1        stop after this many frames of a stream (a stall); 
 stall              0         1: no frames, and no error either
 odd                0         1: frames of half the height
 no_fov             0         1: it does not know its field of view
+degrees            0         1: it states its field of view in degrees
+other_fov          0         1: it states that of another camera
+tenths             0         1: its unit is 0.1 mm
+pad                0         bytes between the rows of a frame
+empty              0         1: transfers that carry nothing
+first_ms           50        how long its first frame takes
+unreadable         0         1: properties that it says it has cannot be read
+clock              0         its times: 1: always 0; 2: in ms; 3: 32 bits of 60 MHz, full after 1 s
+aborts             0         1: the driver aborts when it is pulled out
+serial0, serial1             serial numbers of the sensors
+addresses          0         1: all are addresses of the first
 refuse_open,       0         1: that call fails
 refuse_stream,
 refuse_start

@@ -30,7 +30,7 @@ using Milliseconds = std::chrono::milliseconds;
 
 namespace {
 
-constexpr int kMaxDevices = 2;
+constexpr int kMaxDevices = 3;
 constexpr int kMaxDepthMm = 10000;
 constexpr double kFovX = 1.0008; // radians: 585 pixels of focal length at 640 columns
 constexpr double kFovY = 0.7784;
@@ -91,9 +91,9 @@ template <typename T> OniStatus answer(const T& value, void* data, int* size) {
 
 std::vector<OniVideoMode> offered_modes() {
     const int width = control().number("width", 640), height = control().number("height", 480);
+    const auto unit = control().on("tenths") ? ONI_PIXEL_FORMAT_DEPTH_100_UM : ONI_PIXEL_FORMAT_DEPTH_1_MM;
     // As with many sensors, the mode that is on after opening is not the one that is wanted.
-    return {{ONI_PIXEL_FORMAT_DEPTH_1_MM, width / 2, height / 2, 30},
-            {ONI_PIXEL_FORMAT_DEPTH_1_MM, width, height, 30}};
+    return {{unit, width / 2, height / 2, 30}, {unit, width, height, 30}};
 }
 
 class DepthStream : public oni::driver::StreamBase {
@@ -116,7 +116,8 @@ public:
         if (thread_.joinable()) thread_.join();
     }
 
-    int getRequiredFrameSize() override { return mode_.resolutionX * mode_.resolutionY * 2; }
+    int row_bytes() const { return mode_.resolutionX * 2 + int(control().number("pad", 0)); }
+    int getRequiredFrameSize() override { return row_bytes() * mode_.resolutionY; }
 
     OniBool isPropertySupported(int id) override {
         return id == ONI_STREAM_PROPERTY_CROPPING || id == ONI_STREAM_PROPERTY_HORIZONTAL_FOV ||
@@ -128,6 +129,11 @@ public:
     OniStatus getProperty(int id, void* data, int* size) override {
         const bool fov = id == ONI_STREAM_PROPERTY_HORIZONTAL_FOV || id == ONI_STREAM_PROPERTY_VERTICAL_FOV;
         if (fov && control().on("no_fov")) return ONI_STATUS_NOT_SUPPORTED;
+        const bool asked = id == ONI_STREAM_PROPERTY_CROPPING || id == ONI_STREAM_PROPERTY_MIRRORING;
+        if (asked && control().on("unreadable")) return ONI_STATUS_ERROR;
+        if (fov && control().on("degrees"))
+            return answer(float(id == ONI_STREAM_PROPERTY_HORIZONTAL_FOV ? 57.34 : 44.6), data, size);
+        if (fov && control().on("other_fov")) return answer(float(1.2), data, size);
         switch (id) {
         case ONI_STREAM_PROPERTY_CROPPING: return answer(OniCropping{}, data, size);
         case ONI_STREAM_PROPERTY_HORIZONTAL_FOV: return answer(float(kFovX), data, size);
@@ -174,12 +180,13 @@ private:
 
     void run() {
         // A first image takes its time; the runtime drops what comes before start() has returned.
-        auto due = Clock::now() + Milliseconds(50);
+        auto due = Clock::now() + Milliseconds(control().number("first_ms", 50));
         long burst_left = 0;
         while (running_) {
             const long fps = control().number("fps", 30), burst = control().number("burst", 1);
             const long limit = control().number("limit", -1);
             if (control().on("crash")) raise(SIGSEGV);
+            if (control().on("aborts") && !control().on("connected")) abort();
             if (!control().on("connected") || control().on("stall") ||
                 (limit >= 0 && made_ >= limit)) {
                 std::this_thread::sleep_for(Milliseconds(2));
@@ -208,6 +215,7 @@ private:
         const size_t pixels = size_t(mode_.resolutionX) * mode_.resolutionY;
         const size_t count = frames_.size() / pixels;
         auto* out = static_cast<uint16_t*>(frame->data);
+        const int stride = row_bytes();
         if (count == 0) {
             std::memset(out, 0, pixels * 2);
         } else {
@@ -221,12 +229,21 @@ private:
         }
         frame->sensorType = ONI_SENSOR_DEPTH;
         frame->frameIndex = int(++made_);
-        frame->timestamp = uint64_t(made_) * 1000000 / 30;
+        const uint64_t time_us = uint64_t(made_) * 1000000 / 30;
+        switch (control().number("clock", 0)) {
+        case 1: frame->timestamp = 0; break;
+        case 2: frame->timestamp = time_us / 1000; break; // milliseconds
+        case 3: frame->timestamp = ((time_us * 60 + 0xFFFFFFFFull - 60000000) & 0xFFFFFFFFull) / 60; break;
+        default: frame->timestamp = time_us;
+        }
+        if (stride != width * 2) // rows apart, the last first: they overlap
+            for (int row = mode_.resolutionY - 1; row > 0; --row)
+                std::memmove(reinterpret_cast<char*>(out) + size_t(row) * stride, out + size_t(row) * width, width * 2);
         frame->videoMode = mode_;
         frame->width = width;
         frame->height = rows;
-        frame->stride = width * 2;
-        frame->dataSize = rows * frame->stride;
+        frame->stride = stride;
+        frame->dataSize = control().on("empty") ? 0 : rows * frame->stride;
         frame->croppingEnabled = FALSE;
         frame->cropOriginX = frame->cropOriginY = 0;
         raiseNewFrame(frame);
@@ -243,8 +260,18 @@ private:
 
 class Device : public oni::driver::DeviceBase {
 public:
-    explicit Device(int lock) : lock_(lock), modes_(offered_modes()) {}
+    Device(int lock, char number) : lock_(lock), number_(number), modes_(offered_modes()) {}
     ~Device() override { close(lock_); }
+
+    OniBool isPropertySupported(int id) override {
+        return id == ONI_DEVICE_PROPERTY_SERIAL_NUMBER && !serial().empty();
+    }
+    OniStatus getProperty(int id, void* data, int* size) override {
+        if (!isPropertySupported(id) || *size <= int(serial().size())) return ONI_STATUS_NOT_SUPPORTED;
+        std::memcpy(data, serial().c_str(), serial().size() + 1);
+        *size = int(serial().size()) + 1;
+        return ONI_STATUS_OK;
+    }
 
     OniStatus getSensorInfoList(OniSensorInfo** sensors, int* count) override {
         info_ = {ONI_SENSOR_DEPTH, int(modes_.size()), modes_.data()};
@@ -260,7 +287,10 @@ public:
     void destroyStream(oni::driver::StreamBase* stream) override { delete stream; }
 
 private:
+    std::string serial() const { return control().text(std::string("serial") + number_); }
+
     int lock_;
+    char number_;
     std::vector<OniVideoMode> modes_;
     OniSensorInfo info_{};
 };
@@ -278,7 +308,8 @@ public:
         control().reload();
         for (int number = 0; number < kMaxDevices; ++number) {
             auto& info = infos_[number];
-            std::snprintf(info.uri, sizeof info.uri, "virtual://%d", number);
+            const bool again = control().on("addresses") && number > 0; // of the same sensor
+            std::snprintf(info.uri, sizeof info.uri, again ? "virtual://0?depth-size=%d" : "virtual://%d", number);
             std::snprintf(info.vendor, sizeof info.vendor, "selective-depth");
             std::snprintf(info.name, sizeof info.name, "virtual depth sensor");
         }
@@ -301,14 +332,15 @@ public:
             return nullptr;
         }
         // One process at a time, as with a sensor on the USB bus.
-        const std::string lock_path = Control::path() + ".lock" + uri[std::strlen(uri) - 1];
+        const char number = uri[std::strlen("virtual://")];
+        const std::string lock_path = Control::path() + ".lock" + number;
         const int lock = open(lock_path.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0600);
         if (lock < 0 || flock(lock, LOCK_EX | LOCK_NB) != 0) {
             getServices().errorLoggerAppend("device is busy");
             if (lock >= 0) close(lock);
             return nullptr;
         }
-        return new Device(lock);
+        return new Device(lock, number);
     }
     void deviceClose(oni::driver::DeviceBase* device) override { delete device; }
 
