@@ -289,10 +289,10 @@ class OpenNIDevice(DepthSource):
                             f" {timeout_s:g} s. Pull it out and plug it in again."
                         )
                 elif message["kind"] == "found":
-                    self.device = DeviceInfo(**message["device"])
                     if self.state == "lost":
                         self._become("reconnecting", "it is there again")
                 elif message["kind"] == "opened":
+                    self.device = DeviceInfo(**message["device"])
                     return worker, message
                 elif message["kind"] == "error":
                     raise error_of(message)

@@ -169,7 +169,7 @@ class LiveStream:
         like, there = job["like"], devices()
         for info in choose(there, job["uri"], like):
             self.info = info
-            parent.send("found", device=info)
+            parent.send("found")
             self.watch = Watch(info["uri"])
             self._open()
             info["serial"] = self._serial()
@@ -180,7 +180,6 @@ class LiveStream:
             raise JobError(
                 "SourceNotFoundError", f"Of the sensors that are there, none has the serial number {like['serial']}."
             )
-        parent.send("found", device=info)
         kind = info["vendor"], info["name"]
         same = [each["uri"] for each in there if (each["vendor"], each["name"]) == kind]
         self.twins = len({address.partition("?")[0] for address in same}) > 1
@@ -334,7 +333,7 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
     live = LiveStream(job, parent)
     about = describe(live.stream)
     live.start()
-    parent.send("opened", twins=live.twins, **about)
+    parent.send("opened", device=live.info, twins=live.twins, **about)
     width, height = about["width"], about["height"]
     if not slots.fits(width * height * 2):
         raise JobError("DeviceRefusedError", f"Frames of {width}x{height} pixels are too large.")
