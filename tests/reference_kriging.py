@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from kriging_systems import LocalSystem, local_systems
 
-from selective_depth.selectors.improvement.spelled_out import LocalSystem, local_systems
 from selective_depth.selectors.seeds import SeedGrid
 
 Array = npt.NDArray[np.float64]

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kriging_systems import local_systems
 from reference_kriging import reference_pixel
 
 from selective_depth.selectors.acquire import acquire
 from selective_depth.selectors.improvement import ImprovementSelector
-from selective_depth.selectors.improvement.spelled_out import local_systems
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.selection import plan_of
