@@ -71,7 +71,7 @@ class Script(DepthSource):
 
 
 def run(monkeypatch: pytest.MonkeyPatch, source: DepthSource, settings: Settings = SMALL) -> tuple[int, Session]:
-    monkeypatch.setattr(session_module, "open_source", lambda uri: source)
+    monkeypatch.setattr(session_module, "open_and_tell", lambda uri: source)
     session = Session("script", settings)
     return session.run(), session
 

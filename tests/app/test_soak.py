@@ -187,7 +187,7 @@ def soak(uri: str, folder: Path, count: int, turns: Turns) -> None:
     os.environ.setdefault("RUST_LOG", "off")
     folder.mkdir()
     watched = Watched(open_source(uri), turns)
-    session_module.open_source = lambda _: watched
+    session_module.open_and_tell = lambda _: watched
     settings = Settings(
         acquire=AcquireOptions(budget=0.05),
         run=RunOptions(frames=count),
@@ -205,7 +205,7 @@ def soak(uri: str, folder: Path, count: int, turns: Turns) -> None:
 def test_a_viewer_stopped_for_half_a_minute_slows_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both selectors on a live source, saved and sent to a viewer that is stopped meanwhile."""
     source = Watched(open_source("virtual:workstation?size=320x240&live=1"))
-    monkeypatch.setattr(session_module, "open_source", lambda _: source)
+    monkeypatch.setattr(session_module, "open_and_tell", lambda _: source)
     listener = Listener()
     viewer = listener.process
     stop = threading.Timer(15.0, viewer.send_signal, (signal.SIGSTOP,))

@@ -70,7 +70,7 @@ def test_docstring_examples_give_what_they_say(module: str) -> None:
 
 
 def test_commands_and_options_exist(help_of: dict[str, str]) -> None:
-    everywhere = {"--help", "--version", "--completion", "--settings", "--debug", "--verbose"}
+    everywhere = {"--help", "--version", "--completion", "--preset", "--settings", "--debug", "--verbose"}
     seen = 0
     for page in PAGES:
         text = page.read_text().replace("\\\n", " ")

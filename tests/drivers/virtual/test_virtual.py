@@ -364,7 +364,7 @@ def test_the_hand_moves_smoothly_and_stays_near(time_s, seed, name):
         ("kitchen", "workstation, ball, firehose"),
         ("", "workstation, ball, firehose"),
         ("ball?nose=off", "noise"),
-        ("ball?noise=maybe", "kinect, off"),
+        ("ball?noise=maybe", r"kinect\+fixed, off"),
         ("ball?frames=-1", "whole number"),
         ("ball?frames=1e3", "whole number"),
         ("ball?speed=nan", "a number from 0 to 100"),
