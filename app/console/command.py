@@ -38,6 +38,14 @@ PROGRAM = "selective-depth"
 SHELLS = ("bash", "zsh")
 SOURCE_OPTIONS = ("scale", "camera", "mode", "topic", "stream")
 """Options of sources, which every command that opens one takes as ``--NAME VALUE``."""
+_SOURCE_HELP = (
+    "With any command that takes a SOURCE or DEVICE, for what it does not say of itself:",
+    "  --scale N            values per metre of a folder's images, as 1000 or 5000",
+    "  --camera FX,FY,CX,CY intrinsics in pixels",
+    "  --mode 640x480@30    of a sensor",
+    "  --topic NAME         of a ROS bag",
+    "  --stream N           which depth stream of an .oni file, from 1",
+)
 SOURCES = ("source", "sources", "device")
 """Parameters of commands that name what `open_source` opens."""
 Run = Callable[..., int | None]
@@ -77,7 +85,16 @@ class Command:
         """Summary, examples, and the rest of the docstring but for its parameters."""
         text = (inspect.getdoc(self.run) or "").partition("\nParameters\n")[0]
         summary, _, rest = text.partition("\n")
-        return "\n".join([summary, "", "Examples:", *_example_lines(self.examples), *rest.rstrip().split("\n")])
+        lines = [
+            summary,
+            "",
+            "Examples:",
+            *_example_lines(self.examples),
+            *rest.rstrip().split("\n"),
+        ]
+        if set(SOURCES) & set(inspect.signature(self.run).parameters):
+            lines += ["", *_SOURCE_HELP]
+        return "\n".join(lines)
 
 
 COMMANDS: dict[str, Command] = {}
@@ -117,12 +134,7 @@ def overview(examples: Sequence[Example]) -> str:
         "  --debug              show the traceback of an error",
         "  --settings FILE      take options from a TOML file; the command line wins",
         "  --preset paper       take the options that the paper's section V was made with",
-        "With any command that takes a SOURCE, for what it does not say of itself:",
-        "  --scale N            values per metre of a folder's images, as 1000 or 5000",
-        "  --camera FX,FY,CX,CY intrinsics in pixels",
-        "  --mode 640x480@30    of a sensor",
-        "  --topic NAME         of a ROS bag",
-        "  --stream N           which depth stream of an .oni file, from 1",
+        *_SOURCE_HELP,
         "Alone:",
         "  --version            versions of this program and of the OpenNI2 runtime found",
         f"  --completion SHELL   print a completion script for {', '.join(SHELLS)}",

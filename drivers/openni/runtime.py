@@ -39,22 +39,28 @@ class Runtime:
     path: Path
 
     @property
+    def folder(self) -> Path:
+        """Where its drivers are."""
+        return self.path.parent / "OpenNI2" / "Drivers"
+
+    @property
     def pattern(self) -> str:
         """Names of the files that it loads; Debian's differs from what drivers are built as."""
         if sys.platform != "linux":
             return "*.dll" if sys.platform == "win32" else "lib*.dylib"
-        return "lib*.so.0" if self.path.resolve().name.endswith(".so.0") else "lib*.so"
+        debian = self.path.resolve().suffix == ".0" or any(self.folder.glob("lib*.so.0"))
+        return "lib*.so.0" if debian else "lib*.so"
 
     @property
     def not_loaded(self) -> tuple[str, ...]:
         """Files beside its drivers that look like drivers but have a name that it does not load."""
-        files = sorted((self.path.parent / "OpenNI2" / "Drivers").glob("*.so*"))
+        files = sorted(self.folder.glob("*.so*"))
         return tuple(str(file) for file in files if not file.match(self.pattern))
 
     @property
     def drivers(self) -> tuple[str, ...]:
         """Names of the sensor drivers it will load, without prefix and suffix."""
-        files = (self.path.parent / "OpenNI2" / "Drivers").glob(self.pattern)
+        files = self.folder.glob(self.pattern)
         plain = {file.name.partition(".")[0].removeprefix("lib") for file in files}
         return tuple(sorted(plain - {"OniFile", ""}))
 

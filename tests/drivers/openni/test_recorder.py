@@ -83,7 +83,7 @@ def test_frames_of_a_wrong_size_are_not_recorded(virtual_sensor: VirtualSensor, 
 
     report = record(tmp_path / "out.oni", frames=20, progress=disturb)
     assert "15 wrong frames in a row" in report.ended
-    assert 6 <= report.frames < 20 and report.problem == ""
+    assert 6 <= report.frames < 20 and "not whole" not in report.problem
     assert len(images(report.path)) == report.frames
 
 

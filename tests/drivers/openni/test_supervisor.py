@@ -13,9 +13,24 @@ from selective_depth.drivers.openni import OpenNIDevice
 from selective_depth.drivers.openni import device as openni_device
 from selective_depth.drivers.openni.process import Message
 
-FOUND: Message = {
-    "kind": "found",
-    "device": {"uri": "script", "vendor": "", "name": "a script", "usb_vendor_id": 0, "usb_product_id": 0},
+FOUND: Message = {"kind": "found"}
+OPENED: Message = {
+    "kind": "opened",
+    "device": {
+        "uri": "script",
+        "vendor": "",
+        "name": "a script",
+        "usb_vendor_id": 0,
+        "usb_product_id": 0,
+        "serial": "1",
+    },
+    "twins": False,
+    "tenths": False,
+    "width": 8,
+    "height": 6,
+    "fps": 30,
+    "fov_x_rad": 1.0,
+    "fov_y_rad": 0.8,
 }
 OPENED: Message = {"kind": "opened", "width": 8, "height": 6, "fps": 30, "fov_x_rad": 1.0, "fov_y_rad": 0.8}
 OPENS = (FOUND, OPENED)
