@@ -85,13 +85,7 @@ class Command:
         """Summary, examples, and the rest of the docstring but for its parameters."""
         text = (inspect.getdoc(self.run) or "").partition("\nParameters\n")[0]
         summary, _, rest = text.partition("\n")
-        lines = [
-            summary,
-            "",
-            "Examples:",
-            *_example_lines(self.examples),
-            *rest.rstrip().split("\n"),
-        ]
+        lines = [summary, "", "Examples:", *_example_lines(self.examples), *rest.rstrip().split("\n")]
         if set(SOURCES) & set(inspect.signature(self.run).parameters):
             lines += ["", *_SOURCE_HELP]
         return "\n".join(lines)
