@@ -159,7 +159,7 @@ def test_a_damaged_recording_is_exported_alike_with_and_without_a_number(tmp_pat
         assert (every.frame_count, some.frame_count) == (29, 28)
 
 
-@pytest.mark.parametrize("name", ["out.npz", "out.PNG"])
+@pytest.mark.parametrize("name", ["out.npz", "out.PNG", "out.bag"])
 def test_a_file_that_export_does_not_write_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(UsageError, match=r"name of a folder.*ends in \.oni"):
         export("virtual:ball", tmp_path / name, 1)

@@ -32,7 +32,6 @@ OPENED: Message = {
     "fov_x_rad": 1.0,
     "fov_y_rad": 0.8,
 }
-OPENED: Message = {"kind": "opened", "width": 8, "height": 6, "fps": 30, "fov_x_rad": 1.0, "fov_y_rad": 0.8}
 OPENS = (FOUND, OPENED)
 MISFIT: Message = {"kind": "misfit", "problem": "4x3 pixels"}
 DIED: Message = {"kind": "died", "reason": "crashed"}
