@@ -228,7 +228,7 @@ def _print(uri: str, ways: dict[str, Course], budget: float) -> None:
         padding=(0, 0, 0, 2),
     )
     shown.add_column("RMSE / MAE, mm", no_wrap=True)
-    at = sorted({0, *(n - 1 for n in (10, 20) if n < count), count - 1})
+    at = sorted({0, count // 2, count - 1})
     for index in at:
         shown.add_column(f"frame {index}", justify="right", no_wrap=True)
     shown.add_column("mean", justify="right", no_wrap=True)
