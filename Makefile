@@ -7,7 +7,7 @@ WINDOW_PACKAGES := libvulkan1 mesa-vulkan-drivers
 TEST_PACKAGES := libopenni2-0 libopenni2-dev g++ $(WINDOW_PACKAGES) xvfb x11-utils
 
 .DEFAULT_GOAL := help
-.PHONY: help typing run test test-slow lint format system-packages recordings pictures wheel wheel-check docs hooks clean
+.PHONY: help typing run test test-lowest test-slow lint format system-packages recordings pictures wheel wheel-check docs hooks clean
 
 help: ## Show this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -33,6 +33,13 @@ run: $(VENV)/.installed ## Replay the bundled recording: a viewer, or files wher
 test: $(VENV)/.tests-installed ## Run the whole suite (the long forms: make test-slow)
 	@.ci/system-packages $(TEST_PACKAGES) || echo "Going on without: the tests that need them are skipped."
 	@$(BIN)/python -m pytest -m "$(QUICK)"
+
+SMOKE := tests/drivers/test_frame.py tests/drivers/bag tests/selectors/test_seeds.py tests/selectors/test_quality.py tests/app/test_selecting.py tests/app/test_memory.py
+test-lowest: ## Run the suite's smoke part on the oldest versions that are allowed
+	@$(PYTHON) -m venv --clear .venv/lowest
+	@.ci/lowest > .venv/lowest/constraints.txt
+	@.venv/lowest/bin/pip install --quiet --disable-pip-version-check --constraint .venv/lowest/constraints.txt '.[test]'
+	@NUMBA_CACHE_DIR=.venv/lowest/kernels .venv/lowest/bin/python -m pytest -m "$(QUICK)" $(SMOKE)
 
 test-slow: $(VENV)/.tests-installed ## Run the long forms: fuzzing, soak, hundreds of cycles
 	@.ci/system-packages $(TEST_PACKAGES)
