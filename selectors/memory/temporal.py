@@ -26,10 +26,10 @@ from selective_depth.selectors.seeds import Measure, SeedGrid, answers
 from selective_depth.selectors.selection import Selector, Worth, plan_of
 from selective_depth.selectors.triangulation import Surface
 
-CALM_LOOKS, ALERT_LOOKS = 0.15, 0.4
+CALM_LOOKS, ALERT_LOOKS = 0.15, 0.3
 """Share of a frame's budget that looks out, in a still scene and for `ALERT_FRAMES` after a
 change."""
-ALERT_FRAMES = 10
+ALERT_FRAMES = 3
 EXTENT_ROUNDS = 3
 """Rounds of shots along the border of what has changed."""
 MOST_LOST = 1000
