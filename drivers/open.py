@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from selective_depth.drivers.errors import SourceNotFoundError
@@ -38,17 +37,10 @@ def open_source(uri: str | Path) -> DepthSource:
         raise SourceNotFoundError(f"a source with no name was given. {_WHAT_THERE_IS}")
     scheme, _, rest = name.partition(":")
     if scheme.partition("?")[0] == "openni":
-        from selective_depth.drivers.openni import DeviceSettings, OpenNIDevice
+        from selective_depth.drivers.openni import OpenNIDevice, parse_address
 
-        # An address may have a '?' of its own.
-        address, query = [*re.split(r"\?(?=(?:mode|camera)=)", name[6:], maxsplit=1), ""][:2]
-        options = Options(query, f"'openni{address}'")
-        mode = options.numbers("mode", "WIDTHxHEIGHT@FPS", 1, 1e5, r"x|@")
-        sizes = [int(each) for each in mode or ()]
-        settings = DeviceSettings(sizes[0], sizes[1], sizes[2]) if sizes else None
-        intrinsics = options.camera()
-        options.done()
-        return OpenNIDevice(address.removeprefix(":"), settings, intrinsics=intrinsics)
+        address, settings, intrinsics = parse_address(name[6:].removeprefix(":"))
+        return OpenNIDevice(address, settings, intrinsics=intrinsics)
     if scheme == "virtual":
         from selective_depth.drivers.virtual import VirtualSource
 

@@ -89,6 +89,8 @@ def export(source: str, out: Path, frames: int | None) -> int:
             count = readable if frames is None else min(readable, frames)
         else:
             with open_and_tell(source) as opened:
+                for note in opened.notes:
+                    say(f"note: {note}")
                 if opened.frame_count is None and frames is None:
                     raise UsageError(f"'{source}' never ends; say how many frames to save, as in --frames 100.")
                 count = _save(opened, out, frames, progress)

@@ -201,6 +201,8 @@ def _read_bytes(path: Path, limit: int) -> bytes:
 
 
 def _size_from_header(path: Path, header: bytes) -> tuple[int, int]:
+    if header.startswith(b"version https://git-lfs"):
+        raise DamagedRecordingError(f"'{path}' is a Git LFS pointer and not the image; `git lfs pull` fetches it.")
     if not header.startswith(SIGNATURE) or header[12:16] != b"IHDR":
         what = "empty" if not header else "no PNG file, whatever its name says"
         raise DamagedRecordingError(f"'{path}' is {what}; {_NEXT}.")

@@ -4,7 +4,7 @@ OpenNI2 itself runs in a process of its own (`worker`): what crashes or hangs th
 becomes a named error here, and frames already delivered stay good.
 """
 
-from selective_depth.drivers.openni.device import DeviceSettings, OpenNIDevice
+from selective_depth.drivers.openni.device import DeviceSettings, OpenNIDevice, parse_address
 from selective_depth.drivers.openni.recorder import RecordingReport, record
 from selective_depth.drivers.openni.sensors import DeviceInfo, list_devices, runtime_version, survey
 
@@ -14,6 +14,7 @@ __all__ = [
     "OpenNIDevice",
     "RecordingReport",
     "list_devices",
+    "parse_address",
     "record",
     "runtime_version",
     "survey",

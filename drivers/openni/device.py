@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni.form import upright
 from selective_depth.drivers.openni.process import Message, Worker, camera_of, error_of
 from selective_depth.drivers.openni.sensors import DeviceInfo
+from selective_depth.drivers.options import Options
 from selective_depth.drivers.source import DepthSource
 
 _OPEN_S = 10.0  # a sensor that loads its firmware takes seconds
@@ -63,6 +65,23 @@ class DeviceSettings:
     nearest: bool = False
     registration: bool = False
     first_frame_s: float = 10.0
+
+
+def parse_address(text: str) -> tuple[str, DeviceSettings | None, tuple[float, ...] | None]:
+    """Address, settings and intrinsics of a sensor's name with options, ``ADDRESS?mode=640x480@30``.
+
+    Raises
+    ------
+    SourceNotFoundError
+        If an option is unknown or wrong.
+    """
+    # An address may have a '?' of its own.
+    address, query = [*re.split(r"\?(?=(?:mode|camera|scale|topic|stream)=)", text, maxsplit=1), ""][:2]
+    options = Options(query, f"the sensor '{address}'")
+    mode = [int(each) for each in options.numbers("mode", "WIDTHxHEIGHT@FPS", 1, 1e5, r"x|@") or ()]
+    intrinsics = options.camera()
+    options.done()
+    return address, DeviceSettings(mode[0], mode[1], mode[2]) if mode else None, intrinsics
 
 
 class _Count:

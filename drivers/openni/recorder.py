@@ -9,7 +9,7 @@ from pathlib import Path
 
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni import OniRecorder
-from selective_depth.drivers.openni.device import DeviceSettings, OpenNIDevice
+from selective_depth.drivers.openni.device import DeviceSettings, OpenNIDevice, parse_address
 
 _BEAT_S = 0.1  # how often it is looked whether it is over
 
@@ -60,7 +60,7 @@ def record(
     out_path : str or Path
         The file to make, ending in ``.oni``.
     device_uri : str, default ""
-        Which sensor; empty for the only one.
+        Which sensor, with options as `parse_address` takes them; empty for the only one.
     frames : int, optional
         How many frames to record; default until stopped.
     duration_s : float, optional
@@ -79,6 +79,7 @@ def record(
     SourceNotFoundError, RuntimeMissingError, DeviceRefusedError
         As for `OpenNIDevice`.
     """
+    address, asked, intrinsics = parse_address(device_uri)
     recorder = OniRecorder(out_path, overwrite=overwrite)
     taken = made = 0
 
@@ -97,7 +98,7 @@ def record(
             progress(told)
 
     try:
-        with OpenNIDevice(device_uri, settings, tap=take) as device:
+        with OpenNIDevice(address, settings or asked, tap=take, intrinsics=intrinsics) as device:
             started = time.monotonic()
             recorder.fps = device.fps
             try:

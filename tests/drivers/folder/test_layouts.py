@@ -364,6 +364,12 @@ def test_a_listed_image_that_is_missing_is_named(tmp_path: Path, scene: list[Val
         open_source(root)
 
 
+def test_an_image_that_git_lfs_has_not_fetched_is_named(tmp_path: Path) -> None:
+    (tmp_path / "0.png").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
+    with pytest.raises(DamagedRecordingError, match=r"0\.png' is a Git LFS pointer.*git lfs pull"):
+        open_source(tmp_path)
+
+
 # Other kinds of images, and arrays
 
 

@@ -102,7 +102,11 @@ def test_the_nearest_mode_is_taken_and_said(virtual_sensor: VirtualSensor) -> No
         assert device.read().shape == (424, 512)
 
 
-def test_a_mode_that_is_asked_for(virtual_sensor: VirtualSensor) -> None:
+def test_a_mode_that_is_asked_for(virtual_sensor: VirtualSensor, tmp_path: Path) -> None:
+    out = tmp_path / "out.oni"
+    assert cli.run(["record", str(out), "--frames", "3", "--mode", "320x240@30"]) == 0
+    with open_source(out) as recording:
+        assert recording.read().shape == (240, 320)
     with open_source("openni:virtual://0?mode=320x240@30&camera=300,301,160,120") as device:
         assert device.camera == Camera(320, 240, 300, 301, 160, 120)
         assert device.read().shape == (240, 320)
