@@ -91,7 +91,7 @@ class RecordedFolder(DepthSource):
         self.notes = doubtful_order(self._files)
         self.frame_count = len(self._files)
         self.dropped = 0
-        shape = _shape_of(self._files, sidecar.camera) if self._stack is None else self._size()
+        shape = _shape_of(self._files, sidecar.camera) if self._stack is None else self._stack.shape[1:]
         self.camera, camera_from = self._camera(shape, intrinsics, sidecar.camera, beside)
         self._timestamps_us = sidecar.timestamps_us or self.found.timestamps_us
         if self._timestamps_us is not None and len(self._timestamps_us) != self.frame_count:
@@ -157,12 +157,8 @@ class RecordedFolder(DepthSource):
     def _raw(self, index: int) -> npt.NDArray[Any]:
         return read_raw(self._files[index]) if self._stack is None else self._stack[index]
 
-    def _size(self) -> tuple[int, int]:
-        height, width = self._raw(0).shape
-        return height, width
-
     def _camera(
-        self, shape: tuple[int, int], given: tuple[float, ...] | None, sidecar: Camera | None, beside: CameraFile | None
+        self, shape: tuple[int, ...], given: tuple[float, ...] | None, sidecar: Camera | None, beside: CameraFile | None
     ) -> tuple[Camera, str]:
         """The camera, and where it comes from."""
         height, width = shape

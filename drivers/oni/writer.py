@@ -115,10 +115,6 @@ class RecordWriter:
         self.payload_offset, self.payload_size = self._offset - len(payload), len(payload)
         self._latest_us = max(self._latest_us, timestamp_us)
 
-    def frame_count(self, node: int) -> int:
-        """How many frames of a node there are."""
-        return len(self._entries[node])
-
     def close(self) -> None:
         """Finish the file. Harmless when called twice."""
         if self._file.closed:
@@ -294,7 +290,7 @@ class OniWriter:
         assert self._camera is not None
         path = self._writer.path
         self._codec = CODEC_NONE
-        written, compressed = self._writer.frame_count(1), path.with_name(f"{path.name}.part")
+        written, compressed = self._writer.payload_size > 0, path.with_name(f"{path.name}.part")
         self._writer.close()
         path.replace(compressed)
         try:

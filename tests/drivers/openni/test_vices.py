@@ -15,6 +15,7 @@ from virtual_sensor import VirtualSensor
 from selective_depth.app import cli
 from selective_depth.drivers.errors import DeviceLostError, DeviceRefusedError, SourceNotFoundError, SourceTimeoutError
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.oni import write_oni
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.openni import DeviceSettings, OpenNIDevice, record
 from selective_depth.drivers.openni.runtime import Runtime
@@ -213,3 +214,18 @@ def test_an_orbbec_sensor_is_known_on_the_bus(tmp_path: Path) -> None:
         (device / name).write_text(f"{value}\n")
     said = usb_advice(("PS1080",), tmp_path / "sys", tmp_path / "dev")
     assert "Orbbec sensor is on the USB bus" in said and "liborbbec.so" in said
+
+
+def test_a_recording_does_not_care_for_a_broken_driver(
+    virtual_sensor: VirtualSensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = [DepthFrame(np.full((48, 64), 900 + n, np.uint16), n, 33_333 * n, Camera.kinect(64, 48)) for n in range(3)]
+    write_oni(tmp_path / "walk.oni", frames)
+    virtual_sensor.set(hang_open=1, crash=1, aborts=1, connected=0)
+    (virtual_sensor.runtime / "OpenNI2" / "Drivers" / "libBroken.so.0").write_text("no library")
+    began_s = time.monotonic()
+    assert cli.run(["check", str(tmp_path / "walk.oni")]) == 0
+    assert cli.run(["export", str(tmp_path / "walk.oni"), str(tmp_path / "frames")]) == 0
+    assert cli.run(["replay", str(tmp_path / "walk.oni"), "--headless", "--save", str(tmp_path / "a.rrd")]) == 0
+    assert time.monotonic() - began_s < 60
+    assert "nothing is wrong with it" in capsys.readouterr().out
