@@ -219,7 +219,9 @@ def test_an_orbbec_sensor_is_known_on_the_bus(tmp_path: Path) -> None:
 def test_a_recording_does_not_care_for_a_broken_driver(
     virtual_sensor: VirtualSensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    frames = [DepthFrame(np.full((48, 64), 900 + n, np.uint16), n, 33_333 * n, Camera.kinect(64, 48)) for n in range(3)]
+    frames = [
+        DepthFrame(np.full((240, 320), 900 + n, np.uint16), n, 33_333 * n, Camera.kinect(320, 240)) for n in range(3)
+    ]
     write_oni(tmp_path / "walk.oni", frames)
     virtual_sensor.set(hang_open=1, crash=1, aborts=1, connected=0)
     (virtual_sensor.runtime / "OpenNI2" / "Drivers" / "libBroken.so.0").write_text("no library")
