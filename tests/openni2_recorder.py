@@ -25,7 +25,7 @@ class Parent:
 
 def main(library: str, out: str, frames: int, width: int, height: int) -> None:
     worker.initialize({"library": library})
-    settings = {"width": width, "height": height, "fps": 30, "registration": False, "mode": ""}
+    settings = {"width": width, "height": height, "fps": 30, "registration": False, "nearest": False}
     live = worker.LiveStream({"uri": "", "like": None, "settings": settings}, Parent())
     recorder = openni2.Recorder(out.encode())
     recorder.attach(live.stream, False)
