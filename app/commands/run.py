@@ -254,7 +254,7 @@ class Session:
             quantisation_error_mm=result.regions.quantisation_error_mm,
         )
         if result.model is not None:
-            for name in ("rmse_mm", "truth_rmse_mm", "sensor_rmse_mm"):
+            for name in ("rmse_mm", "truth_rmse_mm", "sensor_rmse_mm", "even_rmse_mm"):
                 result.figures[name] = getattr(result.model, name)
         if result.memory is not None:
             size = result.frame.depth_mm.size

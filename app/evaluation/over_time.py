@@ -221,17 +221,11 @@ def _picture(frame: DepthFrame, step: TemporalStep) -> Figure:
 def _print(uri: str, ways: dict[str, Course], budget: float) -> None:
     console = Console(highlight=False, no_color=not colours())
     count = len(ways["memory"].rmse_mm)
-    shown = Table(
-        title=f"{uri}: {count} frames, {100 * budget:g} % of the pixels a frame with memory",
-        title_justify="left",
-        box=None,
-        padding=(0, 0, 0, 2),
-    )
-    shown.add_column("RMSE / MAE, mm", no_wrap=True)
+    title = f"{uri}: {count} frames, {100 * budget:g} % of the pixels a frame with memory"
+    shown = Table(title=title, title_justify="left", box=None, padding=(0, 0, 0, 2))
     at = sorted({0, count // 2, count - 1})
-    for index in at:
-        shown.add_column(f"frame {index}", justify="right", no_wrap=True)
-    shown.add_column("mean", justify="right", no_wrap=True)
+    for head in ("RMSE / MAE, mm", *(f"frame {index}" for index in at), "mean"):
+        shown.add_column(head, no_wrap=True)
     for way, course in ways.items():
         cells = [f"{course.rmse_mm[i]:.1f} / {course.mae_mm[i]:.1f}" for i in at]
         mean = f"{np.nanmean(course.rmse_mm):.1f} / {np.nanmean(course.mae_mm):.1f}"

@@ -10,6 +10,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Self
 
+import numpy as np
+
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline.result import FrameResult, Model
 from selective_depth.app.pipeline.selecting import gas_of, improvement_of, selector_of
@@ -18,11 +20,16 @@ from selective_depth.app.pipeline.warm_up import compiling_beside
 from selective_depth.app.settings import Settings
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import Acquisition, acquire
+from selective_depth.selectors.even import even_lattice
 from selective_depth.selectors.improvement import ImprovementSelection
 from selective_depth.selectors.memory import TemporalAcquisition, TemporalStep
 from selective_depth.selectors.neural_gas import RegionSelection
+from selective_depth.selectors.quality import errors_of
+from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.seeds import SeedGrid
 
+EVEN_EVERY = 10
+"""Of a recording's frames, one in so many is measured evenly as well, to tell what selecting gains."""
 MODEL_EVERY = 10
 """Of a sensor's frames, one in so many gets a dense model: at 30 frames/s, one of every frame
 would take most of a core, which the frames themselves need."""
@@ -214,7 +221,7 @@ class Pipeline:
         """What the memory measured in a frame, and its model held against it."""
         with self.times.stage("model", stages_ms):
             acquisition = Acquisition(step.uv, step.depth_mm, step.batch, frame.shape, (), f"{step.by}, with memory")
-            return acquisition, Model.of(step.model_mm, frame)
+            return acquisition, Model.of(step.model_mm, frame, self._even_rmse_mm(frame, len(step.uv)))
 
     def _model_of_some(self, frame: DepthFrame, acquisition: Acquisition) -> Model | None:
         """Begin a model now and then, and return it when it is made."""
@@ -229,7 +236,18 @@ class Pipeline:
 
     def _model(self, frame: DepthFrame, acquisition: Acquisition, stages_ms: dict[str, float] | None = None) -> Model:
         with self.times.stage("model", stages_ms):
-            return Model.of(acquisition.reconstruct(self._threads), frame)
+            depth_mm = acquisition.reconstruct(self._threads)
+            return Model.of(depth_mm, frame, self._even_rmse_mm(frame, len(acquisition.uv)))
+
+    def _even_rmse_mm(self, frame: DepthFrame, measurements: int) -> float:
+        """What an even lattice of so many measurements would be off, for one in `EVEN_EVERY` frames."""
+        if frame.index % EVEN_EVERY and not self._realtime:
+            return math.nan
+        truth_mm = frame.truth_mm if self._remembers and frame.truth_mm is not None else frame.depth_mm
+        seen_mm = np.where(frame.depth_mm > 0, truth_mm, 0)
+        uv = even_lattice(frame.shape, measurements)
+        even_mm = reconstruct(uv, frame.measure(uv), frame.shape, threads=self._threads)
+        return errors_of(even_mm, seen_mm).rmse_mm if seen_mm.any() else math.nan
 
     def __enter__(self) -> Self:
         return self

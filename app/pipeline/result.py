@@ -31,6 +31,9 @@ class Model:
     truth_rmse_mm, sensor_rmse_mm : float
         The same of the model and of the full frame against exact truth, over pixels of the frame
         with depth; NaN where no truth is known.
+    even_rmse_mm : float
+        The same as `rmse_mm`, or with a memory as `truth_rmse_mm`, of an even lattice of as many
+        measurements; NaN where none was made.
     """
 
     depth_mm: npt.NDArray[np.float32]
@@ -38,9 +41,10 @@ class Model:
     rmse_mm: float
     truth_rmse_mm: float = math.nan
     sensor_rmse_mm: float = math.nan
+    even_rmse_mm: float = math.nan
 
     @classmethod
-    def of(cls, depth_mm: npt.NDArray[np.float32], frame: DepthFrame) -> Model:
+    def of(cls, depth_mm: npt.NDArray[np.float32], frame: DepthFrame, even_rmse_mm: float = math.nan) -> Model:
         """A model and what it is off from its frame and from the truth."""
         known = frame.depth_mm > 0
         error_mm = np.abs(depth_mm - frame.depth_mm.astype(np.float32))
@@ -50,7 +54,7 @@ class Model:
             seen = known & (frame.truth_mm > 0)
             truth_mm = frame.truth_mm[seen].astype(np.float32)
             to_truth = _rms(depth_mm[seen] - truth_mm), _rms(frame.depth_mm[seen] - truth_mm)
-        return cls(depth_mm, error_mm, _rms(error_mm[known]), *to_truth)
+        return cls(depth_mm, error_mm, _rms(error_mm[known]), *to_truth, even_rmse_mm)
 
 
 def _rms(off_mm: npt.NDArray[np.floating]) -> float:

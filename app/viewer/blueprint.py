@@ -97,7 +97,7 @@ def _figures(memory: bool) -> rrb.Horizontal:
         contents = [f"/figures/{figure}" for figure in figures]
         return rrb.TimeSeriesView(origin="/figures", contents=contents, name=name, plot_legend=rrb.Corner2D.LeftTop)
 
-    errors = ("rmse_mm", "truth_rmse_mm", "sensor_rmse_mm")
+    errors = ("rmse_mm", "truth_rmse_mm", "sensor_rmse_mm", "even_rmse_mm")
     return rrb.Horizontal(
         rrb.TextDocumentView(origin="/guide", name="How to read it"),
         rrb.Spatial2DView(origin="/legend", name="Colours", background=legend.BACKGROUND),

@@ -72,12 +72,6 @@ class Acquisition:
         """Which measurements returned depth, shape (n,)."""
         return self.depth_mm > 0
 
-    def round_image(self) -> npt.NDArray[np.uint8]:
-        """Round in which each pixel was measured, plus one; 0 = never; shape (H, W)."""
-        image = np.zeros(self.frame_shape, np.uint8)
-        image[self.uv[:, 1], self.uv[:, 0]] = self.round + 1
-        return image
-
     def mask(self, number: int | None = None) -> npt.NDArray[np.bool_]:
         """Pixels shot in a round (0 = the seeds), or in all rounds after the seeds."""
         chosen = self.round > 0 if number is None else self.round == number

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -95,20 +94,6 @@ class RegionSelection(Selection):
             _rasterise(uv, self.triangles[long], states, longest, state, score)
             score *= 1 - np.float32(0.1) * even_rank(score.shape)
         return Selection(self.complement, score, "neural gas, long edges")
-
-    @cached_property
-    def edges_kept(self) -> npt.NDArray[np.int32]:
-        """Edges not longer than the threshold, each once: indices of nodes, shape (E, 2)."""
-        ends = np.stack((self.triangles, np.roll(self.triangles, -1, axis=1)), axis=-1)
-        short = np.sort(ends[self.edge_lengths <= self.threshold], axis=1)
-        return np.unique(short, axis=0) if len(short) else short
-
-    @cached_property
-    def nodes_kept(self) -> npt.NDArray[np.bool_]:
-        """Nodes that still have an edge, shape (N,): they drive the rescanning (section III)."""
-        kept = np.zeros(len(self.nodes_mm), dtype=np.bool_)
-        kept[self.edges_kept] = True
-        return kept
 
 
 def delaunay_regions(

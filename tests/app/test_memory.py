@@ -29,7 +29,7 @@ def test_a_run_with_memory_says_shows_and_saves_what_it_knows(
     words = ["replay", STILL, *QUICK, "--memory", "still", "--budget", "5%"]
     assert run([*words, "--save", str(saved), "--save-model", str(model)]) == OK
     told = capsys.readouterr().out
-    for row in ("mm to the truth", "pixels known", "with memory"):
+    for row in ("mm to the truth", "pixels known", "with memory", "even lattice", "times as good"):
         assert row in told
     assert tomllib.loads(saved.with_suffix(".toml").read_text())["memory"] == "still"
     entities = {str(part.entity_path) for part in RrdReader(str(saved)).stream()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -15,6 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from selective_depth.app import cli
 from selective_depth.app.commands import run as session_module
 from selective_depth.app.commands.run import Session
 from selective_depth.app.console import interrupt
@@ -415,3 +417,14 @@ def test_without_a_display_the_run_is_saved(
     assert code == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"replay.rrd", "replay.toml", "replay.png"}
     assert "No display here" in capsys.readouterr().out
+
+
+def test_the_end_report_says_the_gain(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["replay", "virtual:ball?size=160x120&frames=12&noise=off", "--headless", "--budget", "5%"]
+    assert cli.run([*words, "--seeds.rows", "32", "--seeds.columns", "32", "--gas.nodes", "60"]) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if "times as good" in line)
+    found = re.fullmatch(r"(.+)% of the pixels · (.+) mm · even lattice (.+) mm · (.+) times as good", line)
+    assert found is not None
+    share, model_mm, even_mm, times = map(float, found.groups())
+    assert share == pytest.approx(100 * (32 * 32 + 960) / (160 * 120), abs=0.1)
+    assert times == pytest.approx(even_mm / model_mm, rel=0.1) and times > 1
