@@ -241,7 +241,7 @@ class Pipeline:
 
     def _even_rmse_mm(self, frame: DepthFrame, measurements: int) -> float:
         """What an even lattice of so many measurements would be off, for one in `EVEN_EVERY` frames."""
-        if frame.index % EVEN_EVERY and not self._realtime:
+        if frame.index % EVEN_EVERY and (self._remembers or not self._realtime):
             return math.nan
         truth_mm = frame.truth_mm if self._remembers and frame.truth_mm is not None else frame.depth_mm
         seen_mm = np.where(frame.depth_mm > 0, truth_mm, 0)

@@ -108,13 +108,11 @@ def _fuse(values: Float32Array, before_mm: float) -> tuple[float, int, float]:
 
 
 @njit(cache=True, nogil=True)
-def book(memory: Memory, uv: npt.NDArray[np.int32], depth_mm: Float32Array, now: int) -> int:
+def book(memory: Memory, uv: npt.NDArray[np.int32], depth_mm: Float32Array, now: int) -> None:
     """Take in measurements of frame `now`: pixels (n, 2), column first, and depth, 0 = no return.
 
-    A pixel that has missed three times, and more often than it had returned, is known no more; how
-    many became so is returned.
+    A pixel that has missed three times, and more often than it had returned, is known no more.
     """
-    lost = 0
     values = np.empty(KEPT, np.float32)
     for i in range(len(uv)):
         u, v, z = uv[i, 0], uv[i, 1], depth_mm[i]
@@ -123,7 +121,6 @@ def book(memory: Memory, uv: npt.NDArray[np.int32], depth_mm: Float32Array, now:
             missed = min(memory.missed[v, u] + 1, 255)
             memory.missed[v, u] = missed
             if missed >= 3 and missed > memory.held[v, u] > 0:
-                lost += 1
                 memory.held[v, u] = memory.place[v, u] = memory.dissent[v, u] = 0
                 memory.fused_mm[v, u] = 0
             continue
@@ -138,7 +135,6 @@ def book(memory: Memory, uv: npt.NDArray[np.int32], depth_mm: Float32Array, now:
         memory.fused_mm[v, u] = fused
         memory.dissent[v, u] = dissent
         memory.apart_mm2[v, u] = apart
-    return lost
 
 
 def forget(memory: Memory, where: npt.NDArray[np.bool_]) -> None:

@@ -33,7 +33,7 @@ ALERT_FRAMES = 3
 EXTENT_ROUNDS = 3
 """Rounds of shots along the border of what has changed."""
 MOST_LOST = 1000
-"""Points that have become holes before the mesh is made anew without them."""
+"""Points of the mesh that stand in holes by now, before it is made anew without them."""
 PROBATION = 8
 """Frames without a sign of motion before the memory is relied on, where the budget pays for a fresh
 start in every frame: a hand may hold a camera still for a moment."""
@@ -200,7 +200,6 @@ class TemporalAcquisition:
         self._still = 0
         self._memory = Memory.of(shape)
         self._surface = Surface(shape, threads)
-        self._lost = 0
         self._by = ""
 
     def step(self, measure: Measure) -> TemporalStep:
@@ -318,14 +317,14 @@ class TemporalAcquisition:
         """Take in this frame's answers from number `first` on, and draw the model."""
         uv = np.concatenate([np.empty((0, 2), np.int32), *sensor.uv[first:]])
         mm = np.concatenate([np.empty(0, np.float32), *sensor.depth_mm[first:]])
-        self._lost += book(self._memory, uv, mm, self._frame)
-        # No point is taken out of a mesh: some that stand in holes by now may stay for a while.
-        if anew or self._lost > MOST_LOST:
-            self._lost = 0
+        book(self._memory, uv, mm, self._frame)
+        if anew:  # no point is ever taken out of a mesh
             self._surface = Surface(self.shape, self._threads)
             rows, columns = np.nonzero(self._memory.held)
             uv = np.stack((columns, rows), axis=-1).astype(np.int32)
         self._surface.put(uv, self._memory.fused_mm[uv[:, 1], uv[:, 0]])
+        if self._surface.points - np.count_nonzero(self._memory.held) > MOST_LOST:
+            self._book(sensor, len(sensor.uv), anew=True)
 
     def _measure_best(self, sensor: _Sensor, shots: int) -> None:
         """Measure the pixels that are worth most, and draw what comes of it."""

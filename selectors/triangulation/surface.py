@@ -276,6 +276,11 @@ class Surface:
         self._point = np.full(shape, -1, np.int32)
         self._mesh: Mesh | None = None
 
+    @property
+    def points(self) -> int:
+        """How many samples it holds."""
+        return len(self._uv)
+
     def add(self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.generic]) -> None:
         """Take in samples: pixels (n, 2), column first, none given before, and depth (n,) in mm.
 
