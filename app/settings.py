@@ -103,7 +103,7 @@ class GasOptions:
     epochs: Count = 50
     """Passes over the seeds of the exact training."""
     algorithm: Literal["exact", "fast"] = "fast"
-    """Cold training: the published steps, or one with no larger error in a fraction of the time."""
+    """Cold training: the published steps, or batch passes, as good on scenes, in a fraction of the time."""
     training: Literal["live", "cold"] = "live"
     """Go on from the last frame's nodes, or train every frame from nothing."""
     seed: Natural = 0

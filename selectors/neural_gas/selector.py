@@ -36,7 +36,8 @@ class NeuralGasSelector:
         training converges by itself and does not use it.
     algorithm : {"fast", "exact"}, default "fast"
         How `select` trains: ``exact`` takes the published steps one by one, ``fast`` batch passes
-        that reach a lower quantisation error in a fiftieth of the time.
+        that reach a lower quantisation error in a fiftieth of the time on scenes (on depth without
+        any structure, 3.4 % more).
     seed : int, default 0
         Seed of the random draws; equal seeds give equal selections.
     edge_metric : {"3d", "image"}, default "3d"

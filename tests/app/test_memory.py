@@ -68,7 +68,7 @@ def test_a_memory_of_many_frames_does_not_grow() -> None:
 
     from selective_depth.selectors.memory import TemporalAcquisition
 
-    with open_source("virtual:workstation?speed=0&frames=20&moving=ball") as source:
+    with open_source("virtual:workstation?speed=0&frames=20") as source:
         frames = list(source)
     memory = TemporalAcquisition((480, 640))
     held = []
