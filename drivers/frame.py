@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 DepthArray = npt.NDArray[np.uint16]
 """Depth image, shape (height, width), millimetres, 0 = no measurement."""
+ColourArray = npt.NDArray[np.uint8]
+"""Colour image, shape (height, width, 3), red-green-blue."""
 
 MOST_PX = 1e6
 """Greatest focal length, and farthest principal point, of any camera: so that no metric point of
@@ -147,11 +150,22 @@ class DepthFrame:
         Where the frame came from, for messages and reports.
     truth_mm : uint16 array of shape (height, width) or None
         The exact depth, where a simulated sensor knows it; nobody who selects may look at it.
+    colour : uint8 array of shape (height, width, 3) or None
+        What a colour camera saw nearest in time, red-green-blue; None where there is none. Kept and
+        read-only as `depth_mm` is.
+    colour_us : int or None
+        When, on the clock of `timestamp_us`; default that.
+    colour_camera : Camera or None
+        The colour camera's intrinsics, None if they are not known; default, where the images are
+        registered, those of depth.
+    registered : bool
+        Whether the colour image lies on the depth image, pixel on pixel. Told by the device, the
+        layout, the sidecar or the user, never assumed.
 
     Raises
     ------
     ValueError
-        If the array's type or shape or the timestamp is not as stated, saying what was expected.
+        If an array's type or shape or a timestamp is not as stated, saying what was expected.
     """
 
     depth_mm: DepthArray
@@ -160,6 +174,10 @@ class DepthFrame:
     camera: Camera
     source: str = ""
     truth_mm: DepthArray | None = None
+    colour: ColourArray | None = None
+    colour_us: int | None = None
+    colour_camera: Camera | None = None
+    registered: bool = False
 
     def __post_init__(self) -> None:
         depth = self.depth_mm
@@ -176,12 +194,29 @@ class DepthFrame:
                 f"depth_mm has shape {depth.shape}, but the camera is {self.camera.height} rows"
                 f" by {self.camera.width} columns"
             )
-        handed_over = type(depth) is np.ndarray and depth.base is None and not depth.flags.writeable
-        if not (handed_over and depth.flags.c_contiguous and depth.dtype.isnative):
-            # A sensor fills its buffer again: a frame that is kept stays what it was.
-            depth = np.array(np.ma.filled(depth, 0), np.uint16, order="C")
-            depth.flags.writeable = False
-            object.__setattr__(self, "depth_mm", depth)
+        object.__setattr__(self, "depth_mm", _kept(depth, np.uint16))
+        if self.colour is not None:
+            self._check_colour(self.colour)
+
+    def _check_colour(self, colour: ColourArray) -> None:
+        kind = getattr(colour, "dtype", type(colour).__name__)
+        shape: tuple[int, ...] = getattr(colour, "shape", ())
+        if kind != np.uint8 or len(shape) != 3 or shape[2] != 3 or 0 in shape:
+            raise ValueError(f"colour must be a uint8 array of shape (height, width, 3), got {kind} {shape}")
+        if self.registered and shape[:2] != self.shape:
+            raise ValueError(
+                f"colour has shape {shape}; registered to depth it must have its rows and columns, {self.shape}"
+            )
+        camera = self.colour_camera or (self.camera if self.registered else None)
+        if camera is not None and shape[:2] != (camera.height, camera.width):
+            raise ValueError(
+                f"colour has shape {shape}, but its camera is {camera.height} rows by {camera.width} columns"
+            )
+        time_us = self.timestamp_us if self.colour_us is None else self.colour_us
+        if not -MOST_TIME_US <= time_us <= MOST_TIME_US:
+            raise ValueError(f"colour_us is {time_us}; it must lie within {MOST_TIME_US} of 0")
+        for name, value in (("colour", _kept(colour, np.uint8)), ("colour_camera", camera), ("colour_us", time_us)):
+            object.__setattr__(self, name, value)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -203,6 +238,20 @@ class DepthFrame:
         """
         depth_mm: DepthArray = self.depth_mm[uv[:, 1], uv[:, 0]]
         return depth_mm
+
+    def colours_at(self, uv: npt.NDArray[np.integer]) -> ColourArray | None:
+        """Colours of depth pixels (n, 2), shape (n, 3); None where colour does not lie on depth."""
+        return self.colour[uv[:, 1], uv[:, 0]] if self.colour is not None and self.registered else None
+
+
+def _kept(image: npt.NDArray[Any], kind: type[np.generic]) -> npt.NDArray[Any]:
+    """An image that nobody can change: itself, where that is so already, or a copy."""
+    handed_over = type(image) is np.ndarray and image.base is None and not image.flags.writeable
+    if not (handed_over and image.flags.c_contiguous and image.dtype.isnative):
+        # A sensor fills its buffer again: a frame that is kept stays what it was.
+        image = np.array(np.ma.filled(image, 0), kind, order="C")
+        image.flags.writeable = False
+    return image
 
 
 def millimetres(raw: npt.NDArray[np.generic], values_per_metre: float, marks: Sequence[int] = ()) -> DepthArray:

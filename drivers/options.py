@@ -128,6 +128,14 @@ class Options:
             raise self._refuse(name, value, allowed)
         return numbers
 
+    def words_or_numbers(
+        self, name: str, words: Sequence[str], what: str, low: float, high: float
+    ) -> str | tuple[float, ...]:
+        """One of the words, the first by default, or numbers as `numbers` takes them."""
+        if self._given.get(name, words[0]) in words:
+            return self.choice(name, words[0], words)
+        return self.numbers(name, what, low, high) or ""
+
     def text(self, name: str, what: str) -> str:
         """Any text; empty if absent."""
         return self._take(name, what) or ""

@@ -76,6 +76,7 @@ STATE_COLOURS = {
 HOW_TO_READ = """\
 From left to right: measured → wanted → acquired → known.
 
+- **Scene** – what a colour camera sees, where there is one.
 - **1 Sensor** – every pixel of the frame.
 - **2 Seeds** – the lattice that is measured first: all that the selectors know.
 - **3a Neural gas** – nodes settle on surfaces; triangles whose edges are short are the regions \

@@ -89,6 +89,15 @@ def depth_panel(frame: DepthFrame, caption: str = "Depth") -> Panel:
     return Panel("depth", caption, image, scale, _scene_note(frame))
 
 
+def scene_panel(frame: DepthFrame) -> Panel | None:
+    """What the colour camera saw; None where there was none."""
+    if frame.colour is None:
+        return None
+    height, width = frame.shape
+    image = cv2.resize(frame.colour, (width, height), interpolation=cv2.INTER_AREA)
+    return Panel("scene", "Scene", np.asarray(image), note="" if frame.registered else "not registered to depth")
+
+
 def shaded_panel(frame: DepthFrame, caption: str = "Scene", note: str = "") -> Panel:
     """The surfaces of a frame lit from the upper left."""
     from matplotlib.colors import LightSource
@@ -173,7 +182,9 @@ def error_panel(frame: DepthFrame, model_mm: npt.NDArray[np.float32], caption: s
 
 def panels_of(row: StillRow) -> list[Panel]:
     """Every panel of one source, left to right."""
-    shown = [depth_panel(row.frame), regions_panel(row.frame, row.regions), improvement_panel(row.improvement)]
+    scene = scene_panel(row.frame)
+    shown = [scene] if scene is not None else []
+    shown += [depth_panel(row.frame), regions_panel(row.frame, row.regions), improvement_panel(row.improvement)]
     if row.acquisition is not None:
         shown.append(samples_panel(row.frame, row.acquisition))
         shown.append(error_panel(row.frame, row.acquisition.reconstruct(), "Model error"))

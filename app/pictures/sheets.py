@@ -43,7 +43,10 @@ def contact_sheet(rows: Sequence[StillRow], width_in: float = WIDTH_IN) -> Figur
     width_in : float, default 16
         Width of the page in inches.
     """
-    return sheet([(row.title, panels_of(row)) for row in rows], width_in)
+    coloured = any(row.frame.colour is not None for row in rows)
+    # Where one row has a scene, one without keeps its place: columns stay what they are.
+    gaps = [[None] * (coloured and row.frame.colour is None) for row in rows]
+    return sheet([(row.title, [*gap, *panels_of(row)]) for row, gap in zip(rows, gaps, strict=True)], width_in)
 
 
 def sheet(rows: Sequence[Row], width_in: float = WIDTH_IN, *, legend: bool = True) -> Figure:
@@ -144,7 +147,7 @@ def _fill(axes: Axes, panel: Panel, zoom: float) -> None:
 
 def _caption(axes: Axes, panel: Panel, each: float, tall: float, zoom: float) -> None:
     """Write a panel's caption above it; draw its colour bar, with ticks, and its note below."""
-    large, small = (13, 10) if each >= 3.5 else (11.5, 9)
+    large, small = (13, 10) if each >= 3.5 else (11.5, 9) if each >= 2.6 else (10, 8)
     axes.text(0, 1 + 0.09 / tall, _told(panel.caption), transform=axes.transAxes,
               size=large * zoom, weight="bold", color=INK)  # fmt: skip
     below: dict[str, Any] = {"transform": axes.transAxes, "size": small * zoom, "color": PALE}

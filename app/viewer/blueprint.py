@@ -13,6 +13,8 @@ def blueprint(
     by: str | None,
     detail: bool,
     memory: bool = False,
+    colour: bool = False,
+    coloured_cloud: bool = False,
     look_at_m: float = 2.0,
     limits_mm: tuple[float, float] = (500.0, 5000.0),
 ) -> rrb.Blueprint:
@@ -26,6 +28,10 @@ def blueprint(
         Whether what is known lasts: its age and what was forgotten have a view then.
     detail : bool
         Whether the inner read-outs have views too.
+    colour : bool, default False
+        Whether there is a colour image.
+    coloured_cloud : bool, default False
+        Whether it lies on the depth image, so that the cloud has its colours.
     look_at_m : float, default 2.0
         Depth around which the view in space turns, in metres.
     limits_mm : tuple of float, default (500, 5000)
@@ -38,12 +44,17 @@ def blueprint(
     estimate = _image("3b Estimate", "improvement/estimate", "improvement/unknown")
     deviation = _image("3b Deviation", "improvement/deviation", "improvement/unknown")
     columns: list[rrb.Container | rrb.View] = [
-        rrb.Vertical(_image("1 Sensor", "depth", "holes"), _image("2 Seeds", "seeds")),
+        rrb.Vertical(
+            *([rrb.Spatial2DView(origin="/colour", name="Scene", background=legend.BACKGROUND)] if colour else []),
+            _image("1 Sensor", "depth", "holes"),
+            _image("2 Seeds", "seeds"),
+        ),
         rrb.Vertical(
             rrb.Tabs(gas, gas_long) if detail else gas, rrb.Tabs(score, estimate, deviation) if detail else score
         ),
     ]
-    space = ["/camera", "/camera/depth", "/world/nodes", "/world/regions"]
+    cloud = "/world/cloud" if coloured_cloud else "/camera/depth"
+    space = ["/camera", cloud, "/world/nodes", "/world/regions", *(["/colour"] if colour else [])]
     if by is not None:
         samples = _image(f"4 Acquired by {by}", "samples", "holes")
         known = _image("4 Known, by age", "memory/age", "memory/changed")

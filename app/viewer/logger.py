@@ -14,6 +14,7 @@ from selective_depth.app.pictures import palette as legend
 from selective_depth.app.pipeline import STAGES, FrameResult
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.blueprint import blueprint, epoch_blueprint
+from selective_depth.drivers.colour import jpeg_of
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.selectors.memory import TemporalStep
 from selective_depth.selectors.neural_gas import RegionSelection
@@ -21,6 +22,9 @@ from selective_depth.selectors.neural_gas import RegionSelection
 DEPTH_COLOURS = legend.palette(legend.DEPTH_COLOURMAP)
 CENTRE = np.float32(0.5)
 """Rerun puts pixel centres at halves, we at whole numbers."""
+JPEG_QUALITY = 80
+CLOUD_STEP = 2
+"""The coloured cloud has every second pixel each way: all of them would be 5 MB a frame."""
 
 
 class StepLogger:
@@ -40,16 +44,23 @@ class StepLogger:
         self._start_us: int | None = None
         self._state = ""
         self._limits_mm = (0.0, 1.0)
+        self._coloured = False
 
     def log(self, step: FrameResult) -> None:
         """Log a step under its frame's number and time."""
         if self._start_us is None:
             self._start_us = step.frame.timestamp_us
             self._log_static(step)
+        if step.frame.colour is not None and not self._coloured:  # a sensor's may come a little later
+            self._coloured = True
+            self._send_blueprint(step)
+            if step.frame.colour_camera is not None:
+                self._log_camera(step.frame.colour_camera, "colour")
         self._stream.set_time("frame", sequence=step.frame.index)
         elapsed_us = step.frame.timestamp_us - self._start_us
         self._stream.set_time("time", duration=elapsed_us / 1e6)
         self._log_sensor(step)
+        self._log_colour(step.frame)
         self._log_gas(step.regions)
         self._log_improvement(step)
         self._log_acquisition(step)
@@ -81,21 +92,14 @@ class StepLogger:
             self._stream.log("sensor/state", rr.StateChange(state=state))
 
     def _log_static(self, step: FrameResult) -> None:
-        camera, log, options = step.frame.camera, self._stream.log, self._options
+        log, options = self._stream.log, self._options
         near, far = legend.depth_limits_mm(step.frame.depth_mm)
         near = near if options.near_mm is None else options.near_mm
         far = far if options.far_mm is None else options.far_mm
         self._limits_mm = (float(near), float(max(far, near + 1)))
-        layout = blueprint(
-            by=None if step.acquisition is None else step.acquisition.by,
-            detail=options.detail,
-            memory=step.memory is not None,
-            look_at_m=_middle_m(step.frame.depth_mm),
-            limits_mm=self._limits_mm,
-        )
-        self._stream.send_blueprint(layout, make_default=True)
+        self._send_blueprint(step)
         self._stream.send_recording_name(step.frame.source or "depth")
-        self._log_camera(camera)
+        self._log_camera(step.frame.camera)
         pixels = step.seeds.lattice_uv.reshape(-1, 2) + CENTRE
         log("camera/seeds", rr.Points2D.from_fields(positions=pixels, radii=1.6), static=True)
         self._log_classes()
@@ -113,7 +117,19 @@ class StepLogger:
         for name, (label, colour) in legend.FIGURES.items():
             log(f"figures/{name}", rr.SeriesLines(names=label, colors=colour), static=True)
 
-    def _log_camera(self, camera: Camera) -> None:
+    def _send_blueprint(self, step: FrameResult) -> None:
+        layout = blueprint(
+            by=None if step.acquisition is None else step.acquisition.by,
+            detail=self._options.detail,
+            memory=step.memory is not None,
+            colour=self._coloured,
+            coloured_cloud=self._coloured and step.frame.registered,
+            look_at_m=_middle_m(step.frame.depth_mm),
+            limits_mm=self._limits_mm,
+        )
+        self._stream.send_blueprint(layout, make_default=True)
+
+    def _log_camera(self, camera: Camera, entity: str = "camera") -> None:
         log = self._stream.log
         log("/", rr.ViewCoordinates.RDF, static=True)
         pinhole = rr.Pinhole(
@@ -122,7 +138,7 @@ class StepLogger:
             principal_point=[camera.cx + CENTRE, camera.cy + CENTRE],
             image_plane_distance=0.3,
         )
-        log("camera", pinhole, static=True)
+        log(entity, pinhole, static=True)
 
     def _log_classes(self) -> None:
         log = self._stream.log
@@ -144,6 +160,19 @@ class StepLogger:
         colours = np.where(seeds.valid.ravel(), DEPTH_COLOURS[level.astype(np.uint8)], np.uint32(legend.HOLE))
         log("camera/seeds", rr.Points2D.from_fields(colors=colours))
         self.log_state(step.state)
+
+    def _log_colour(self, frame: DepthFrame) -> None:
+        """The colour image, as JPEG: a twentieth of its bytes; where it lies on depth, a cloud in its colours."""
+        if frame.colour is None:
+            return
+        image = rr.EncodedImage(contents=jpeg_of(frame.colour, JPEG_QUALITY), media_type="image/jpeg")
+        self._stream.log("colour", image)
+        if frame.registered:
+            rows, columns = np.nonzero(frame.depth_mm[::CLOUD_STEP, ::CLOUD_STEP])
+            uv = np.stack((columns, rows), axis=-1) * CLOUD_STEP
+            points_m = frame.camera.points_mm(uv, frame.measure(uv)) * np.float32(0.001)
+            packed = frame.colour[uv[:, 1], uv[:, 0]] @ np.array((1 << 24, 1 << 16, 1 << 8), np.uint32) | np.uint32(255)
+            self._stream.log("world/cloud", rr.Points3D(points_m, colors=packed, radii=-1.2))
 
     def _log_gas(self, regions: RegionSelection) -> None:
         log = self._stream.log

@@ -8,12 +8,14 @@ import time
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.drivers.colour import Colouring
 from selective_depth.drivers.errors import SourceEndedError, SourceNotFoundError, SourceTimeoutError
-from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
+from selective_depth.drivers.frame import Camera, ColourArray, DepthArray, DepthFrame
 from selective_depth.drivers.options import Options
 from selective_depth.drivers.source import DepthSource
 from selective_depth.drivers.virtual.moving import MOVING, moving_shapes
 from selective_depth.drivers.virtual.noise import kinect_depth
+from selective_depth.drivers.virtual.paint import paint
 from selective_depth.drivers.virtual.renderer import cast
 from selective_depth.drivers.virtual.scenes import ALBEDO, ALIASES, SCENES, Material, Scene
 
@@ -44,6 +46,7 @@ class VirtualSource(DepthSource):
         ``moving=ball``, or more of `MOVING` with ``+`` between: what else moves;
         ``cut=ball@20``, to another scene, from that frame on;
         ``size=640x480``, the field of view's width stays that of a Kinect;
+        ``colour=off``: no colour image, which else lies on the depth image;
         ``live=0`` or ``1``: paced at 30 frames a second like a device, the newest frame wins.
 
     Raises
@@ -68,6 +71,7 @@ class VirtualSource(DepthSource):
         self._cut = options.change("cut", tuple(SCENES))
         width, height = options.size("size", (640, 480))
         self.live = options.choice("live", "0", ("0", "1")) == "1"
+        self._colouring = Colouring.of(options)
         options.done()
         self.frame_count = frames or (None if self.live else 120)
         self.uri = f"virtual:{name}"
@@ -95,9 +99,10 @@ class VirtualSource(DepthSource):
             raise SourceEndedError(f"all frames of {self.uri} are delivered")
         index = self._next
         self._next += 1
-        depth_mm, truth_mm = self._render(index, noise=self._noise != "off")
+        depth_mm, truth_mm, colour = self._render(index, noise=self._noise != "off", coloured=self._colouring.wanted)
         time_us = round(index * 1e6 / FPS)
-        return DepthFrame(depth_mm, index, time_us, self.camera, self.uri, truth_mm=truth_mm)
+        frame = DepthFrame(depth_mm, index, time_us, self.camera, self.uri, truth_mm=truth_mm)
+        return frame if colour is None else self._colouring.colour(frame, colour, time_us, True)
 
     def depth_at(self, index: int, *, noise: bool) -> DepthArray:
         """Depth of frame `index`, exact or as a Kinect reports it, whatever was read so far.
@@ -109,8 +114,10 @@ class VirtualSource(DepthSource):
         """
         return self._render(index, noise=noise)[0]
 
-    def _render(self, index: int, *, noise: bool) -> tuple[DepthArray, DepthArray]:
-        """Depth as asked for, and the exact one."""
+    def _render(
+        self, index: int, *, noise: bool, coloured: bool = False
+    ) -> tuple[DepthArray, DepthArray, ColourArray | None]:
+        """Depth as asked for, the exact one, and colour if it is wanted."""
         scene = self._scene
         if self._cut is not None and index >= self._cut[1]:
             scene = SCENES[self._cut[0]]()
@@ -125,12 +132,13 @@ class VirtualSource(DepthSource):
         with np.errstate(divide="ignore"):
             exact = np.where(nearness > 0, np.rint(1.0 / nearness), 0).astype(np.uint16)
         exact.flags.writeable = False
+        colour = paint(nearness, material, self.camera, rotation, position_mm) if coloured else None
         if not noise:
-            return exact, exact
+            return exact, exact, colour
         frame_seed = (self.seed << 32) + index + 1
         fixed_seed = (self.seed << 32) if self._noise == "kinect+fixed" else None
         seen = kinect_depth(nearness, material, _ALBEDO, self.camera, frame_seed, fixed_seed)
-        return seen, exact
+        return seen, exact, colour
 
     def close(self) -> None:
         """No frame follows."""
