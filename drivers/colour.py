@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import io
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from selective_depth.drivers.frame import MOST_PX, Camera, ColourArray, DepthArray, DepthFrame
 from selective_depth.drivers.options import Options
 
 PAIR_US: Final = 20_000
 """Images farther apart in time than this are not of one moment: at 30 frames/s the nearest is always nearer."""
+MOST_PIXELS: Final = 1 << 26
 CONVERSIONS: Final = {
     "RGB888": (None, 3), "YUV422": (cv2.COLOR_YUV2RGB_UYVY, 2), "YUYV": (cv2.COLOR_YUV2RGB_YUY2, 2),
     "GRAY8": (cv2.COLOR_GRAY2RGB, 1), "BGR8": (cv2.COLOR_BGR2RGB, 3), "RGBA8": (cv2.COLOR_RGBA2RGB, 4),
@@ -38,20 +42,33 @@ def rgb_of(data: Any, kind: str, width: int, height: int) -> ColourArray | None:
     width, height : int
         Size in pixels.
     """
-    raw = np.frombuffer(data, np.uint8)
     if kind in ("JPEG", "PNG"):
-        image: Any = cv2.imdecode(raw, cv2.IMREAD_COLOR) if raw.size else None
-        if image is None or image.shape != (height, width, 3):
-            return None
-        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    else:
-        conversion, size = CONVERSIONS[kind]
-        if raw.size < width * height * size:
-            return None
-        raw = raw[: width * height * size].reshape(height, width, size)
-        image = raw.copy() if conversion is None else cv2.cvtColor(raw, conversion)
+        decoded = rgb_of_file(io.BytesIO(data))
+        return decoded if decoded is not None and decoded.shape == (height, width, 3) else None
+    raw = np.frombuffer(data, np.uint8)
+    conversion, size = CONVERSIONS[kind]
+    if raw.size < width * height * size:
+        return None
+    raw = raw[: width * height * size].reshape(height, width, size)
+    image = raw.copy() if conversion is None else cv2.cvtColor(raw, conversion)
     image.flags.writeable = False  # handed over: the frame need not copy it
     return np.asarray(image, np.uint8)
+
+
+def rgb_of_file(file: Path | io.BytesIO) -> ColourArray | None:
+    """The image of a file; None if it is none, damaged or larger than `MOST_PIXELS`.
+
+    Pillow reads it: OpenCV's decoders print on standard error what they find damaged.
+    """
+    try:
+        with Image.open(file) as image:
+            if image.width * image.height > MOST_PIXELS:
+                return None
+            colour = np.array(image.convert("RGB"), np.uint8)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+    colour.flags.writeable = False  # handed over: the frame need not copy it
+    return colour
 
 
 def jpeg_of(colour: ColourArray, quality: int) -> bytes:
@@ -133,6 +150,10 @@ class Colouring:
             )
         registered = registered and colour.shape[:2] == frame.shape
         return replace(frame, colour=colour, colour_us=time_us, colour_camera=camera, registered=registered)
+
+
+ON: Final = Colouring()
+"""Colour as the source tells."""
 
 
 def on_depth(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from selective_depth.drivers.colour import Colouring
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.options import Options
 from selective_depth.drivers.source import DepthSource
@@ -62,9 +63,9 @@ def open_source(uri: str | Path) -> DepthSource:
     if path.is_dir() or (suffix in (".npy", ".npz") and path.exists()):
         from selective_depth.drivers.folder import RecordedFolder
 
-        scale, intrinsics = options.scale(), options.camera()
+        scale, intrinsics, colouring = options.scale(), options.camera(), Colouring.of(options)
         options.done()
-        return RecordedFolder(path, values_per_metre=scale, intrinsics=intrinsics)
+        return RecordedFolder(path, values_per_metre=scale, intrinsics=intrinsics, colouring=colouring)
     if suffix == ".oni":
         from selective_depth.drivers.oni import OniReader
 

@@ -23,8 +23,8 @@ DEPTH_COLOURS = legend.palette(legend.DEPTH_COLOURMAP)
 CENTRE = np.float32(0.5)
 """Rerun puts pixel centres at halves, we at whole numbers."""
 JPEG_QUALITY = 80
-CLOUD_STEP = 2
-"""The coloured cloud has every second pixel each way: all of them would be 5 MB a frame."""
+CLOUD_STEP = 3
+"""The coloured cloud has every third pixel each way: all of them would be 5 MB a frame."""
 
 
 class StepLogger:
@@ -172,7 +172,7 @@ class StepLogger:
             uv = np.stack((columns, rows), axis=-1) * CLOUD_STEP
             points_m = frame.camera.points_mm(uv, frame.measure(uv)) * np.float32(0.001)
             packed = frame.colour[uv[:, 1], uv[:, 0]] @ np.array((1 << 24, 1 << 16, 1 << 8), np.uint32) | np.uint32(255)
-            self._stream.log("world/cloud", rr.Points3D(points_m, colors=packed, radii=-1.2))
+            self._stream.log("world/cloud", rr.Points3D(points_m, colors=packed, radii=-1.8))
 
     def _log_gas(self, regions: RegionSelection) -> None:
         log = self._stream.log

@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.drivers.colour import nearest
 from selective_depth.drivers.errors import DamagedRecordingError, SourceNotFoundError
 from selective_depth.drivers.folder.images import SUFFIXES
 from selective_depth.drivers.folder.sidecar import SIDECAR, read_text
@@ -73,7 +74,9 @@ class Layout:
     convert : callable, optional
         Millimetres of values that have no scale.
     colour : str
-        The colour images beside, as a pattern from the root.
+        The colour images beside, as a pattern from the root; several with ``|`` between.
+    registered : bool
+        They lie on the depth images, pixel on pixel.
     """
 
     name: str
@@ -88,18 +91,20 @@ class Layout:
     stamp: tuple[str, float] | None = None
     convert: Callable[[_Values], _Values] | None = None
     colour: str = ""
+    registered: bool = False
 
 
 _XTION: Final = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _KINECT: Final = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 _KITTI: Final = Camera(1242, 375, 721.5377, 721.5377, 609.5593, 172.854)
+_BESIDE: Final = "color/*|colour/*|rgb/*|image/*"
 _LISTS: Final = ("depth.txt", "associations.txt", "associate.txt", "association.txt")
 _STAMP: Final = (r"^[0-9]+-([0-9]{1,15})$", 1.0)
 _VIRTUAL_KITTI: Final = Camera(1242, 375, 725.0087, 725.0087, 620.5, 187.0)
 
 
 def _tum(name: str, camera: Camera | None = _XTION, **more: object) -> Layout:
-    row = {"values_per_metre": 5000.0, "lists": _LISTS, "colour": "rgb/*"} | more
+    row = {"values_per_metre": 5000.0, "lists": _LISTS, "colour": "rgb/*", "registered": True} | more
     return Layout(name, "depth/*", camera=camera, **row)  # type: ignore[arg-type]
 
 
@@ -115,30 +120,30 @@ LAYOUTS: Final = (
     _tum("Bonn", Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098), named="rgbd_bonn"),
     _tum("ETH3D", None, signs=("calibration.txt",)),
     _tum("OpenLORIS", None, named=r"^(office|corridor|home|cafe|market)[0-9]+-[0-9]+$",
-         values_per_metre=1000.0),
+         values_per_metre=1000.0, registered=False),
     _tum("TUM", assumed=True),
     Layout("KITTI", "proj_depth/*/image_0[23]/*.png", 256.0, _KITTI),
     Layout("Virtual KITTI 2", "frames/depth/Camera_[01]/depth_*.png", 100.0, _VIRTUAL_KITTI,
-           marks=(65535,), colour="frames/rgb/Camera_[01]/rgb_*.jpg"),
+           marks=(65535,), colour="frames/rgb/Camera_[01]/rgb_*.jpg", registered=True),
     Layout("Replica", "results/depth*.png", 6553.5, Camera(1200, 680, 600.0, 600.0, 599.5, 339.5),
-           colour="results/frame*.jpg"),
+           colour="results/frame*.jpg", registered=True),
     Layout("ARKitScenes", "lowres_depth/*.png", stamp=(rf"_({_DECIMAL})$", 1e6),
-           colour="lowres_wide/*.png"),
+           colour="lowres_wide/*.png", registered=True),
     Layout("TartanAir", "depth_left/*.npy", camera=Camera(640, 480, 320.0, 320.0, 320.0, 240.0),
-           colour="image_left/*"),
+           colour="image_left/*", registered=True),
     Layout("NYU raw", "d-*-*.pgm", camera=Camera(640, 480, 582.6245, 582.691, 313.0448, 238.4439),
            stamp=(rf"^d-({_DECIMAL})-", 1e6), convert=_kinect_raw, colour="r-*.ppm"),
-    Layout("BOP", "depth/*", signs=("scene_camera.json",), colour="rgb/*"),
+    Layout("BOP", "depth/*", signs=("scene_camera.json",), colour="rgb/*", registered=True),
     Layout("SUN3D", "depth/*.png", camera=_XTION, signs=("intrinsics.txt", "image"), stamp=_STAMP,
-           convert=_rotated, colour="image/*.jpg"),
+           convert=_rotated, colour="image/*.jpg", registered=True),
     *(
         Layout("ScanNet", "depth/*", signs=(sign,), colour="color/*")
         for sign in ("intrinsic/intrinsic_depth.txt", "intrinsic_depth.txt")
     ),
     Layout("Open3D / RealSense", "depth/*.png", signs=("camera_intrinsic.json",), assumed=True,
-           colour="color/*"),
+           colour="color/*", registered=True),
     Layout("Open3D / Azure Kinect", "depth/*.png", signs=("intrinsic.json",), assumed=True,
-           colour="color/*"),
+           colour="color/*", registered=True),
     *(
         Layout("BundleFusion", "frame-*.depth.p[ng][gm]", signs=(sign,), marks=(65535,),
                colour="frame-*.color.*")
@@ -152,13 +157,15 @@ LAYOUTS: Final = (
     Layout("7-Scenes", "*.depth.png", camera=_KINECT, marks=(65535,), colour="*.color.png"),
     Layout("YCB-Video", "*-depth.png", 10_000.0,
            Camera(640, 480, 1066.778, 1067.487, 312.9869, 241.3109), signs=("*-meta.mat",),
-           colour="*-color.*"),
+           colour="*-color.*", registered=True),
     Layout("RGB-D Scenes v2", "*-depth.png", camera=Camera(640, 480, 570.3, 570.3, 320.0, 240.0),
-           signs=("*-color.png",), assumed=True, colour="*-color.png"),
+           signs=("*-color.png",), assumed=True, colour="*-color.png", registered=True),
     Layout("RealSense rs-convert", "*_Depth_*.png", assumed=True, colour="*_Color_*.png"),
     Layout("Matterport3D", "*_d[0-2]_[0-5].png", 4000.0, colour="../*/*_i[0-2]_[0-5].jpg"),
-    Layout("Redwood", "depth/*", camera=_XTION, assumed=True, stamp=_STAMP, colour="rgb/*"),
-    Layout("plain", "*", assumed=True),
+    Layout("Redwood", "depth/*", camera=_XTION, signs=("rgb/*-*.jpg",), assumed=True, stamp=_STAMP,
+           colour="rgb/*", registered=True),
+    Layout("Redwood", "depth/*", camera=_XTION, assumed=True, stamp=_STAMP, colour=_BESIDE),
+    Layout("plain", "*", assumed=True, colour=_BESIDE),
 )  # fmt: skip
 ARRAYS: Final = Layout("an array", "*.np[yz]", assumed=True)
 """One file that holds all frames."""
@@ -178,12 +185,15 @@ class Found:
         The depth images, in order.
     timestamps_us : tuple of int or None
         Their times, where a list or the names tell them.
+    colour : tuple of (int, Path) or None
+        Time and colour image of each, where a list tells them; None for one that has none.
     """
 
     row: Layout
     root: Path
     files: list[Path] = field(repr=False)
     timestamps_us: tuple[int, ...] | None = None
+    colour: tuple[tuple[int, Path] | None, ...] | None = None
 
 
 def find_layout(folder: Path) -> Found:
@@ -224,11 +234,11 @@ def _match(row: Layout, folder: Path, up: int) -> Found | None:
         listed = next((root / name for name in row.lists if (root / name).is_file()), None)
         if listed is None:
             return None
-        files, stamps = _read_list(root, listed)
+        files, stamps, colour = _read_list(root, listed)
         # ICL-NUIM numbers its frames where others have a time.
-        return Found(row, root, files, None if row.name == "ICL-NUIM" else stamps)
+        return Found(row, root, files, None if row.name == "ICL-NUIM" else stamps, colour)
     files = _images(root, row.depth, full)
-    return Found(row, root, files, _stamps(row, files)) if files else None
+    return Found(row, root, files, stamps_of(row, files)) if files else None
 
 
 def image_names(folder: Path) -> list[str]:
@@ -263,8 +273,8 @@ def _natural_key(name: str) -> list[tuple[int, Decimal, str]]:
     return [(0, Decimal(part), part) if part.isdecimal() else (1, Decimal(0), part) for part in parts]
 
 
-def _stamps(row: Layout, files: list[Path]) -> tuple[int, ...] | None:
-    """Times in the names: where the layout has them, or where each name is a time of day."""
+def stamps_of(row: Layout, files: list[Path]) -> tuple[int, ...] | None:
+    """Times in the names of images: where the layout has them, or where each name is a time of day."""
     pattern, unit_us = row.stamp or (_EPOCH, 1e6)
     matches = [re.search(pattern, path.stem) for path in files]
     times = [round(Decimal(match[1]) * round(unit_us)) for match in matches if match]
@@ -283,41 +293,66 @@ def doubtful_order(files: list[Path]) -> tuple[str, ...]:
     )
 
 
-def _read_list(root: Path, index: Path) -> tuple[list[Path], tuple[int, ...]]:
-    """Read a list: pairs of a time in seconds and a file, '#' begins a comment.
+def _read_list(
+    root: Path, index: Path
+) -> tuple[list[Path], tuple[int, ...], tuple[tuple[int, Path] | None, ...] | None]:
+    """Depth images with their times, and the colour image of each, as a list of files has them.
 
-    Of the two pairs of an association, the one whose file lies in the depth folder.
+    Colour is the other pair of an association; of ``depth.txt``, what ``rgb.txt`` has nearest in
+    time. Colour images that are not there are no damage.
     """
-    files, timestamps_us = [], []
+    lines = _pairs(index)
+    # Of the two pairs of an association, depth is the one whose file lies in the depth folder.
+    depths = [next((pair for pair in pairs if pair[1].startswith("depth")), pairs[0]) for _, pairs in lines]
+    files, times_us = [root / name for _, name in depths], tuple(time_us for time_us, _ in depths)
+    for (number, _), file in zip(lines, files, strict=True):
+        if not file.exists():
+            raise DamagedRecordingError(
+                f"'{file}' is missing: line {number} of '{index}' names it. Copy it again, or remove that line."
+            )
+    if not files:
+        raise SourceNotFoundError(_nothing_found(root))
+    if any(len(pairs) > 1 for _, pairs in lines):
+        others = [
+            next((pair for pair in pairs if pair != depth), None)
+            for (_, pairs), depth in zip(lines, depths, strict=True)
+        ]
+        return (
+            files,
+            times_us,
+            tuple((other[0], root / other[1]) if other and (root / other[1]).is_file() else None for other in others),
+        )
+    if not (root / "rgb.txt").is_file():
+        return files, times_us, None
+    there = sorted((time_us, root / name) for _, pairs in _pairs(root / "rgb.txt") for time_us, name in pairs)
+    there = [pair for pair in there if pair[1].is_file()]
+    near = [nearest([pair[0] for pair in there], time_us) for time_us in times_us]
+    return files, times_us, tuple(None if k is None else there[k] for k in near)
+
+
+def _pairs(index: Path) -> list[tuple[int, list[tuple[int, str]]]]:
+    """The lines of a list, by number: one pair or two of a time in seconds and a file; '#' begins a comment."""
+    lines = []
     for number, line in enumerate(read_text(index).splitlines(), start=1):
         words = line.partition("#")[0].split()
         if not words:
             continue
-        pairs = [words] if len(words) == 2 else [words[:2], words[2:]]
         try:
-            seconds, name = next((p for p in pairs if p[1].startswith("depth")), pairs[0])
-            timestamp_us = round(float(seconds) * 1e6)
+            pairs = [(round(float(words[at]) * 1e6), words[at + 1]) for at in range(0, len(words), 2)]
         except (ValueError, OverflowError, IndexError):
             raise DamagedRecordingError(
                 f"line {number} of '{index}' is {line!r:.80}; each line is a time in seconds and"
                 " the name of a PNG file."
             ) from None
-        inside = PurePosixPath(name)
-        if inside.is_absolute() or ".." in inside.parts or "\\" in name or ":" in name:
-            raise DamagedRecordingError(
-                f"line {number} of '{index}' names '{name:.80}', which may lie outside of the"
-                " folder; name files inside it, as in depth/0001.png."
-            )
-        if not (root / inside).exists():
-            raise DamagedRecordingError(
-                f"'{root / inside}' is missing: line {number} of '{index}' names it. Copy it again,"
-                " or remove that line."
-            )
-        files.append(root / inside)
-        timestamps_us.append(timestamp_us)
-    if not files:
-        raise SourceNotFoundError(_nothing_found(root))
-    return files, tuple(timestamps_us)
+        for _, name in pairs:
+            inside = PurePosixPath(name)
+            if inside.is_absolute() or ".." in inside.parts or "\\" in name or ":" in name:
+                raise DamagedRecordingError(
+                    f"line {number} of '{index}' names '{name:.80}', which may lie outside of the"
+                    " folder; name files inside it, as in depth/0001.png."
+                )
+        lines.append((number, pairs))
+    return lines
 
 
 def _nothing_found(path: Path) -> str:

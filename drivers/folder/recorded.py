@@ -17,8 +17,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.drivers.colour import ON, Colouring
 from selective_depth.drivers.errors import DamagedRecordingError, SourceEndedError, SourceError, SourceTimeoutError
 from selective_depth.drivers.folder.cameras import CameraFile, find_camera_file
+from selective_depth.drivers.folder.colours import Colours
 from selective_depth.drivers.folder.images import read_raw, read_size, read_stack
 from selective_depth.drivers.folder.layouts import ARRAYS, Found, doubtful_order, find_layout
 from selective_depth.drivers.folder.sidecar import SIDECAR, Sidecar, read_sidecar
@@ -52,6 +54,8 @@ class RecordedFolder(DepthSource):
         Scale of the images; default as the sidecar, a file beside or the layout says.
     intrinsics : (float, float, float, float), optional
         fx, fy, cx, cy in pixels; default likewise, and else a Kinect's.
+    colouring : Colouring, optional
+        What is known of its colour images; default what sidecar and layout say.
 
     Attributes
     ----------
@@ -73,7 +77,12 @@ class RecordedFolder(DepthSource):
     live = False
 
     def __init__(
-        self, path: str | Path, *, values_per_metre: float | None = None, intrinsics: tuple[float, ...] | None = None
+        self,
+        path: str | Path,
+        *,
+        values_per_metre: float | None = None,
+        intrinsics: tuple[float, ...] | None = None,
+        colouring: Colouring = ON,
     ) -> None:
         self.uri = str(path)
         path = Path(path)
@@ -106,10 +115,13 @@ class RecordedFolder(DepthSource):
         if said is None and beside is not None and beside.values_per_metre is not None:
             said, where = beside.values_per_metre, beside.path.name
         self._convert, scale = self._conversion(said, where, marks)
+        self._colours = Colours(self.found, sidecar, colouring, self._timestamps_us)
+        self.notes += tuple(f"'{self.uri}': {note}" for note in self._colours.notes)
         self.about = (
             f"'{self.uri}' is read as {self.layout}: {scale}; camera fx {self.camera.fx:g} fy"
-            f" {self.camera.fy:g} cx {self.camera.cx:g} cy {self.camera.cy:g} ({camera_from})."
+            f" {self.camera.fy:g} cx {self.camera.cx:g} cy {self.camera.cy:g} ({camera_from}){self._colours.about}."
         )
+        self._colour_trouble = False
         self._next = 0
         self._ahead: Future[DepthFrame] | None = None
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="png-reader")
@@ -152,7 +164,11 @@ class RecordedFolder(DepthSource):
             timestamp_us = self._timestamps_us[index]
         depth_mm = self._convert(raw)
         depth_mm.flags.writeable = False  # handed over: the frame need not copy it
-        return DepthFrame(depth_mm, index, timestamp_us, self.camera, self.uri)
+        frame, trouble = self._colours.on(DepthFrame(depth_mm, index, timestamp_us, self.camera, self.uri))
+        if trouble and not self._colour_trouble:  # said once
+            self._colour_trouble = True
+            self.notes += (trouble,)
+        return frame
 
     def _raw(self, index: int) -> npt.NDArray[Any]:
         return read_raw(self._files[index]) if self._stack is None else self._stack[index]

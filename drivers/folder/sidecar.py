@@ -15,6 +15,12 @@
     cx = 320.0
     cy = 240.0
 
+    colour_registered = true
+    colour_place_mm = [25.0, 0.0, 0.0]
+    colour_timestamps_us = [8, 33341, 66675]
+    [colour_camera]
+    …
+
 Every entry may be left out. TOML is read by the standard library and can only hold data.
 """
 
@@ -32,6 +38,8 @@ from selective_depth.drivers.folder.images import MAX_SIDE
 from selective_depth.drivers.frame import MOST_PX, MOST_TIME_US, Camera
 
 SIDECAR: Final = "frames.toml"
+
+SCHEMA: Final = 1
 
 _MAX_TEXT_BYTES: Final = 16 * 1024 * 1024
 _CAMERA_KEYS: Final = ("width", "height", "fx", "fy", "cx", "cy")
@@ -53,6 +61,16 @@ class Sidecar:
         PNG values that mean "no measurement", beside 0 which always does.
     timestamps_us : tuple of int or None
         One per frame, in the order of the files' names; default: spaced by the frame rate.
+    colour_registered : bool or None
+        Whether the colour images lie on the depth images; default as the layout has it.
+    colour_camera : Camera or None
+        Intrinsics of the colour camera.
+    colour_place_mm : tuple of three floats or None
+        Where it stands along the depth camera's axes.
+    colour_timestamps_us : tuple of int or None
+        One per frame; of one without a colour image, any.
+    schema : int
+        Version of these entries.
     """
 
     values_per_metre: float | None = None
@@ -60,6 +78,11 @@ class Sidecar:
     fps: float | None = None
     missing: tuple[int, ...] | None = None
     timestamps_us: tuple[int, ...] | None = None
+    colour_registered: bool | None = None
+    colour_camera: Camera | None = None
+    colour_place_mm: tuple[float, ...] | None = None
+    colour_timestamps_us: tuple[int, ...] | None = None
+    schema: int = SCHEMA
 
 
 def read_sidecar(folder: Path) -> Sidecar:
@@ -80,15 +103,21 @@ def read_sidecar(folder: Path) -> Sidecar:
             f"'{path}' is no valid TOML ({str(error) or 'nested too deep'}); correct it, or remove it to use defaults."
         ) from error
     known = Sidecar.__dataclass_fields__
+    if not _is_integer(schema := entries.get("schema", SCHEMA)) or schema > SCHEMA:
+        raise _wrong(path, "schema", schema, f"up to {SCHEMA}; a later version of this program wrote it, use that")
     for name in entries:
         if name not in known:
             raise _wrong(path, name, "no such entry", f"one of {', '.join(known)}")
     return Sidecar(
         values_per_metre=_number(path, entries, "values_per_metre", 1e-2, 1e6),
-        camera=_camera(path, entries),
+        camera=_camera(path, entries, "camera"),
         fps=_number(path, entries, "fps", 1e-3, 1e4),
         missing=_integers(path, entries, "missing", 0, 65535),
         timestamps_us=_integers(path, entries, "timestamps_us", -MOST_TIME_US, MOST_TIME_US),
+        colour_registered=_truth(path, entries, "colour_registered"),
+        colour_camera=_camera(path, entries, "colour_camera"),
+        colour_place_mm=_place(path, entries, "colour_place_mm"),
+        colour_timestamps_us=_integers(path, entries, "colour_timestamps_us", -MOST_TIME_US, MOST_TIME_US),
     )
 
 
@@ -99,10 +128,12 @@ def write_sidecar(folder: Path, sidecar: Sidecar) -> None:
         if isinstance(value, Camera):
             sizes = {key: int(getattr(value, key)) for key in _CAMERA_KEYS[:2]}
             said[name] = sizes | {key: float(getattr(value, key)) for key in _CAMERA_KEYS[2:]}
+        elif name == "colour_place_mm" and value is not None:
+            said[name] = [float(each) for each in value]
         elif isinstance(value, tuple):
             said[name] = [int(each) for each in value]  # NumPy's whole numbers too
         elif value is not None:
-            said[name] = float(value)
+            said[name] = value if isinstance(value, bool) or name == "schema" else float(value)
     text = "# Depth frames as 16-bit PNG: what the numbers in the files mean.\n"
     new = folder / f"{SIDECAR}.new"
     try:
@@ -139,12 +170,12 @@ def read_text(path: Path) -> str:
         ) from error
 
 
-def _camera(path: Path, entries: dict[str, Any]) -> Camera | None:
-    table = entries.get("camera")
+def _camera(path: Path, entries: dict[str, Any], name: str) -> Camera | None:
+    table = entries.get(name)
     if table is None:
         return None
     if not isinstance(table, dict) or set(table) != set(_CAMERA_KEYS):
-        raise _wrong(path, "camera", table, f"a table of exactly {', '.join(_CAMERA_KEYS)}")
+        raise _wrong(path, name, table, f"a table of exactly {', '.join(_CAMERA_KEYS)}")
     for key in ("width", "height"):
         if not _is_integer(table[key]) or not 1 <= table[key] <= MAX_SIDE:
             raise _wrong(path, key, table[key], f"a whole number from 1 to {MAX_SIDE}")
@@ -153,7 +184,23 @@ def _camera(path: Path, entries: dict[str, Any]) -> Camera | None:
     try:
         return Camera(table["width"], table["height"], *(float(table[key]) for key in _CAMERA_KEYS[2:]))
     except ValueError as error:
-        raise _wrong(path, "camera", error, "a camera that can be") from error
+        raise _wrong(path, name, error, "a camera that can be") from error
+
+
+def _truth(path: Path, entries: dict[str, Any], name: str) -> bool | None:
+    value = entries.get(name)
+    if value is not None and not isinstance(value, bool):
+        raise _wrong(path, name, value, "true or false")
+    return value
+
+
+def _place(path: Path, entries: dict[str, Any], name: str) -> tuple[float, ...] | None:
+    values = entries.get(name)
+    if values is None:
+        return None
+    if not isinstance(values, list) or len(values) != 3:
+        raise _wrong(path, name, values, "a list of three numbers")
+    return tuple(_number(path, {name: each}, name, -MOST_PX, MOST_PX) or 0.0 for each in values)
 
 
 def _number(path: Path, entries: dict[str, Any], name: str, least: float, most: float) -> float | None:
