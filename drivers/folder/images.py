@@ -168,14 +168,14 @@ def read_png(path: Path) -> DepthArray:
     return np.asarray(raw, dtype=np.uint16)
 
 
-def write_png(path: Path, raw: DepthArray, compression: int = 3) -> None:
-    """Write a 16-bit grey PNG.
+def write_png(path: Path, raw: npt.NDArray[Any], compression: int = 3) -> None:
+    """Write a 16-bit grey PNG, or one of 8-bit blue, green and red.
 
     Parameters
     ----------
     path : Path
         The file, replaced if it exists.
-    raw : uint16 array of shape (height, width)
+    raw : uint16 array of shape (height, width), or uint8 array of shape (height, width, 3)
         The values.
     compression : int, default 3
         0 (fast, large) to 9 (slow, small). A 640x480 Kinect frame: 3 takes a third of the time

@@ -8,18 +8,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final, Self
 
+import cv2
+
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.folder.images import write_png
 from selective_depth.drivers.folder.sidecar import SIDECAR, Sidecar, write_sidecar
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.source import DepthSource
 
+COLOUR: Final = "colour"
 _MILLIMETRES: Final = 1000.0
 _DEFAULT_FPS: Final = 30.0
 
 
 class FolderWriter:
-    """Writes frames as a plain folder: ``000000.png`` … and the sidecar.
+    """Writes frames as a plain folder: ``000000.png`` …, colour in ``colour/``, and the sidecar.
 
     The sidecar is there from the first frame on and complete after `close`, so that what a killed
     program leaves can be read. As a context manager it leaves
@@ -45,6 +48,7 @@ class FolderWriter:
         self._compression = compression
         self._sidecar = Sidecar(values_per_metre=_MILLIMETRES, fps=fps)
         self._timestamps_us: list[int] = []
+        self._colour_us: list[int] = []
         self._made = not self.path.exists()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -72,29 +76,44 @@ class FolderWriter:
                 f"frame {frame.index} has {frame.camera}, but the folder '{self.path}' is of"
                 f" {self._sidecar.camera}; write it to another folder"
             )
+        if frame.colour is not None and self._sidecar.colour_registered is None:
+            camera = None if frame.registered else frame.colour_camera
+            self._sidecar = replace(self._sidecar, colour_registered=frame.registered, colour_camera=camera)
         file = self._file(len(self._timestamps_us))
         try:
             write_png(file, frame.depth_mm, self._compression)
+            if frame.colour is not None:
+                (self.path / COLOUR).mkdir(exist_ok=True)
+                # Lossless, and as quick as it can be: noise hardly packs.
+                write_png(self.path / COLOUR / file.name, cv2.cvtColor(frame.colour, cv2.COLOR_RGB2BGR), 1)
         except OSError as error:
             # Half a file would make the whole folder unreadable.
             file.unlink(missing_ok=True)
+            (self.path / COLOUR / file.name).unlink(missing_ok=True)
             raise _output_error(file, error) from error
         self._timestamps_us.append(frame.timestamp_us)
+        self._colour_us.append(frame.colour_us or 0)
 
     def close(self) -> None:
         """Write the timestamps."""
         if self._timestamps_us:
-            self._sidecar = replace(self._sidecar, timestamps_us=tuple(self._timestamps_us))
+            colour_us = None if self._sidecar.colour_registered is None else tuple(self._colour_us)
+            self._sidecar = replace(
+                self._sidecar, timestamps_us=tuple(self._timestamps_us), colour_timestamps_us=colour_us
+            )
             self._write_sidecar()
 
     def discard(self) -> None:
         """Remove what was written, so that it is not in the way of the next attempt."""
         for index in range(len(self._timestamps_us)):
             self._file(index).unlink(missing_ok=True)
+            (self.path / COLOUR / self._file(index).name).unlink(missing_ok=True)
         (self.path / SIDECAR).unlink(missing_ok=True)
         self._timestamps_us.clear()
-        if self._made:
-            with suppress(OSError):  # somebody else has put something there meanwhile
+        with suppress(OSError):  # somebody else has put something there meanwhile
+            if (self.path / COLOUR).exists():
+                (self.path / COLOUR).rmdir()
+            if self._made:
                 self.path.rmdir()
 
     def __enter__(self) -> Self:
