@@ -40,8 +40,8 @@ def open_source(uri: str | Path) -> DepthSource:
     if scheme.partition("?")[0] == "openni":
         from selective_depth.drivers.openni import OpenNIDevice, parse_address
 
-        address, settings, intrinsics = parse_address(name[6:].removeprefix(":"))
-        return OpenNIDevice(address, settings, intrinsics=intrinsics)
+        address, settings, intrinsics, colouring = parse_address(name[6:].removeprefix(":"))
+        return OpenNIDevice(address, settings, intrinsics=intrinsics, colouring=colouring)
     if scheme == "virtual":
         from selective_depth.drivers.virtual import VirtualSource
 
@@ -70,8 +70,9 @@ def open_source(uri: str | Path) -> DepthSource:
         from selective_depth.drivers.oni import OniReader
 
         stream, intrinsics = options.integer("stream", 1, 1, 64), options.camera()
+        colouring = Colouring.of(options)
         options.done()
-        return OniReader(path, stream=stream, intrinsics=intrinsics)
+        return OniReader(path, stream=stream, intrinsics=intrinsics, colouring=colouring)
     if not path.exists():
         raise SourceNotFoundError(f"'{named}' does not exist. {_WHAT_THERE_IS}")
     raise SourceNotFoundError(

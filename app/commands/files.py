@@ -94,14 +94,6 @@ def export(source: str, out: Path, frames: int | None) -> int:
                 if opened.frame_count is None and frames is None:
                     raise UsageError(f"'{source}' never ends; say how many frames to save, as in --frames 100.")
                 count = _save(opened, out, frames, progress)
-                camera = opened.camera
-            middle = (camera.width / 2, camera.height / 2)
-            if to_oni and (abs(camera.cx - middle[0]) > 0.01 or abs(camera.cy - middle[1]) > 0.01):
-                say(
-                    f"note: .oni files store no principal point: that of '{out}' is the image's"
-                    f" middle ({middle[0]:g}, {middle[1]:g}), not ({camera.cx:g}, {camera.cy:g})."
-                    " A folder keeps it."
-                )
     say(f"wrote {out}: {count} frames")
     return OK
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from selective_depth.drivers.frame import Camera, DepthArray
 from selective_depth.drivers.oni.records import CODEC_TABLE, DEPTH_CODECS, MAX_PAYLOAD, NodeType
-from selective_depth.drivers.oni.report import OniNode
+from selective_depth.drivers.oni.report import CAMERA, OniNode
 
 _MILLIMETRES, _TENTHS = 100, 101
 """OpenNI2's numbers of the pixel formats "depth in 1 mm" and "in 100 um"."""
@@ -160,9 +160,11 @@ def no_depth(nodes: list[OniNode]) -> str:
 
 
 def _camera(node: OniNode, width: int, height: int, problem: Problem) -> Camera:
-    fov_rad = node.values_of("xnFOV", "<dd")
+    own, fov_rad = node.values_of(CAMERA, "<dddd"), node.values_of("xnFOV", "<dd")
     optics = node.values_of("xnRealWorldTranslationData", "<ddd")
     try:
+        if own is not None:
+            return Camera(width, height, *own)
         if fov_rad is None and optics is not None:
             # OpenNI 1 at first recorded the size of a pixel at a distance instead.
             distance, pixel_size, pixels_to_depth = optics
@@ -171,7 +173,7 @@ def _camera(node: OniNode, width: int, height: int, problem: Problem) -> Camera:
         if fov_rad is not None:
             return Camera.from_fov(width, height, *fov_rad)
     except (ValueError, ArithmeticError) as error:
-        node.properties.pop("xnFOV", None)
+        node.properties.pop(CAMERA if own is not None else "xnFOV", None)
         problem(node.offset, f"the field of view is wrong: {error}")
     return Camera.kinect(width, height)
 

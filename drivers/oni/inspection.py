@@ -40,10 +40,10 @@ from selective_depth.drivers.oni.records import (
     parse_property,
     read_record,
 )
-from selective_depth.drivers.oni.report import STREAMS, OniFrame, OniNode, OniProblem, OniReport
+from selective_depth.drivers.oni.report import CAMERA, STREAMS, OniFrame, OniNode, OniProblem, OniReport
 
 _MAX_NODES: Final = 64
-_SIZES: Final = {"xnMapOutputMode": 12, "xnCropping": 12, "xnFOV": 16, "xnRealWorldTranslationData": 24}
+_SIZES: Final = {"xnMapOutputMode": 12, "xnCropping": 12, "xnFOV": 16, "xnRealWorldTranslationData": 24, CAMERA: 32}
 _SHAPING: Final = ("xnMapOutputMode", "xnCropping", "oniPixelFormat")
 """Properties that tell what a frame's values are; one that changes ends what can be read."""
 _SCAN_BYTES: Final = 1 << 20
@@ -126,7 +126,7 @@ class _Inspection:
                 depth.frames.clear()
             elif decode:
                 decoded, swapped, turned = self._decode_frames(depth, form)
-                notes += tuple(turned)
+                notes += (*turned, *self._decode_colour())
         return OniReport(
             path=self.path,
             size_bytes=self.size,
@@ -375,6 +375,22 @@ class _Inspection:
                 self._problem(
                     self.size, f"there is no sound seek table of {node.name} at byte {node.seek_table_offset}"
                 )
+
+    def _decode_colour(self) -> tuple[str, ...]:
+        """Drop the colour frames that cannot be decoded; a note where none can be read."""
+        from selective_depth.drivers.oni.colour import OniColour
+
+        colour = OniColour(self.nodes.values())
+        if colour.node is None:
+            return (colour.unsupported,) if colour.unsupported else ()
+        sound = []
+        for frame in colour.node.frames:
+            if time.monotonic() < self.deadline and colour.read(self.file, frame) is None:
+                self._problem(frame.record_offset, f"frame {frame.number} of {colour.node.name} cannot be decoded")
+            else:
+                sound.append(frame)
+        colour.node.frames[:] = sound
+        return ()
 
     def _decode_frames(self, node: OniNode, form: DepthForm) -> tuple[int, int, list[str]]:
         """Drop the frames that cannot be decoded, as far as time allows; mark those turned round.

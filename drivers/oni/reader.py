@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import BinaryIO
 
+from selective_depth.drivers.colour import ON, Colouring
 from selective_depth.drivers.errors import DamagedRecordingError, SourceEndedError, SourceError
 from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
 from selective_depth.drivers.oni.codec import decode_depth
+from selective_depth.drivers.oni.colour import OniColour
 from selective_depth.drivers.oni.files import open_regular, read_payload
 from selective_depth.drivers.oni.form import Sides, turned_at, upright
 from selective_depth.drivers.oni.inspection import inspect_oni
@@ -29,7 +31,9 @@ class OniReader(DepthSource):
     stream : int, default 1
         Which depth stream, from 1.
     intrinsics : (float, float, float, float), optional
-        fx, fy, cx, cy in pixels; default from the recorded field of view.
+        fx, fy, cx, cy in pixels; default as recorded, or from the recorded field of view.
+    colouring : Colouring, optional
+        What is known of its colour; default what is recorded.
 
     Attributes
     ----------
@@ -46,7 +50,14 @@ class OniReader(DepthSource):
 
     live = False
 
-    def __init__(self, path: str | Path, *, stream: int = 1, intrinsics: tuple[float, ...] | None = None) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        stream: int = 1,
+        intrinsics: tuple[float, ...] | None = None,
+        colouring: Colouring = ON,
+    ) -> None:
         self.uri = str(path)
         self.report = inspect_oni(path, stream=stream)
         self.dropped = 0
@@ -68,6 +79,9 @@ class OniReader(DepthSource):
             self.camera = Camera(camera.width, camera.height, *intrinsics)
         self.fps = self.report.fps
         self.frame_count = len(self._frames)
+        self._colour, self._colouring = OniColour(self.report.nodes), colouring
+        if colouring.wanted and self._colour.unsupported:
+            self.notes += (f"'{path}': {self._colour.unsupported}.",)
         self._sides = Sides()
         self._next = 0
         self._file: BinaryIO | None = open_regular(self.report.path)
@@ -103,7 +117,8 @@ class OniReader(DepthSource):
         depth_mm.flags.writeable = False  # handed over: the frame need not copy it
         index = self._next
         self._next += 1
-        return DepthFrame(depth_mm, index, frame.timestamp_us, self.camera, self.uri)
+        whole = DepthFrame(depth_mm, index, frame.timestamp_us, self.camera, self.uri)
+        return self._colour.on(self._file, whole, self._colouring)
 
     def close(self) -> None:
         """Close the file. Harmless when called twice."""

@@ -24,8 +24,9 @@ MAGIC: Final = b"NIR\0"
 CODEC_TABLE: Final = b"16zT"
 CODEC_PLAIN: Final = b"16zP"
 CODEC_NONE: Final = b"NONE"
+CODEC_JPEG: Final = b"JPEG"
 DEPTH_CODECS: Final = (CODEC_TABLE, CODEC_PLAIN, CODEC_NONE)
-CODECS: Final = frozenset((*DEPTH_CODECS, b"JPEG", b"Im8z"))
+CODECS: Final = frozenset((*DEPTH_CODECS, CODEC_JPEG, b"Im8z"))
 """Every compression that OpenNI2's player knows."""
 
 FILE_HEADER: Final = struct.Struct("<4sBBHIQI")

@@ -6,10 +6,12 @@ from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
+from selective_depth.drivers.colour import ON
 from selective_depth.drivers.errors import DamagedRecordingError
 from selective_depth.drivers.folder import FolderWriter
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni.codec import encode_depth
+from selective_depth.drivers.oni.colour import OniColour
 from selective_depth.drivers.oni.files import open_regular, read_payload
 from selective_depth.drivers.oni.inspection import inspect_oni
 from selective_depth.drivers.oni.reader import read_depth
@@ -111,12 +113,14 @@ def export_oni(
     report = _rescuable(path)
     depth, camera = report.depth, report.camera
     assert depth is not None and camera is not None
+    colour = OniColour(report.nodes)
     with open_regular(report.path) as file, FolderWriter(folder, fps=report.fps) as out:
         for index, frame in enumerate(islice(depth.frames, frames)):
             depth_mm = read_depth(report, file, frame)
             if depth_mm is None:
                 raise DamagedRecordingError(f"'{path}' has changed while it was read.")
-            out.write(DepthFrame(depth_mm, index, frame.timestamp_us, camera, str(path)))
+            whole = DepthFrame(depth_mm, index, frame.timestamp_us, camera, str(path))
+            out.write(colour.on(file, whole, ON))
             if progress is not None:
                 progress(index + 1)
     return report

@@ -11,6 +11,10 @@ from selective_depth.drivers.frame import Camera
 from selective_depth.drivers.oni.records import Kind, NodeType
 
 STREAMS: Final = frozenset((NodeType.DEPTH, NodeType.IMAGE, NodeType.IR))
+CAMERA: Final = "selectiveDepthCamera"
+"""Our own property: fx, fy, cx, cy of a stream, since a field of view tells no principal point."""
+REGISTERED: Final = "selectiveDepthRegistered"
+"""Our own property of a depth stream: 1 if colour lies on it. OpenNI2's player steps over both."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,16 +6,20 @@ import math
 import struct
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, Final, Self
 
 import numpy as np
 
+from selective_depth.drivers.colour import jpeg_of
 from selective_depth.drivers.errors import OutputError
-from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
+from selective_depth.drivers.frame import Camera, ColourArray, DepthArray, DepthFrame
 from selective_depth.drivers.oni.codec import MAX_DISTINCT, decode_depth, encode_depth
+from selective_depth.drivers.oni.files import read_payload
 from selective_depth.drivers.oni.records import (
     BEGIN_FIELDS,
+    CODEC_JPEG,
     CODEC_NONE,
     CODEC_TABLE,
     FILE_HEADER,
@@ -33,12 +37,17 @@ from selective_depth.drivers.oni.records import (
     pack_property,
     pack_record,
 )
+from selective_depth.drivers.oni.report import CAMERA, REGISTERED
 from selective_depth.drivers.source import DepthSource
 
 _MAX_DEPTH_MM: Final = 65535
 _DEPTH_1_MM: Final = 100  # OpenNI2's number of this pixel format
 _GREY_16_BIT: Final = 4  # and OpenNI 1's
+_RGB_888: Final = 200
+_RGB_24_BIT: Final = 1
 _DEFAULT_FPS: Final = 30.0
+JPEG_QUALITY: Final = 92
+"""Of recorded colour: it is off by less than its sensor's noise."""
 
 Property = tuple[Kind, bytes]
 
@@ -183,7 +192,10 @@ class RecordWriter:
 
 
 class OniWriter:
-    """Writes depth frames to an .oni file that OpenNI2 replays bit by bit.
+    """Writes frames to an .oni file that OpenNI2 replays, depth bit by bit, colour as JPEG.
+
+    It holds colour if the first frame has any; `colourless` counts frames that have one where it
+    does not.
 
     Parameters
     ----------
@@ -201,8 +213,8 @@ class OniWriter:
 
     Notes
     -----
-    The format stores fields of view, not principal points: a camera that does not look through
-    the middle of its image comes back as one that does. Depth is compressed, until a frame holds
+    The format stores fields of view, not principal points: one that is not the middle is in a
+    property of our own, which other programs step over. Depth is compressed, until a frame holds
     more different depths than that can say: then the file is written anew without.
     """
 
@@ -210,7 +222,10 @@ class OniWriter:
         self._fps = fps
         self._keep = keep
         self._camera: Camera | None = None
+        self._first: DepthFrame | None = None
         self._first_us = 0
+        self._colour_us: int | None = None
+        self.colourless = 0
         self._codec = CODEC_TABLE
         self._writer = RecordWriter(Path(path), keep=keep)
 
@@ -242,8 +257,19 @@ class OniWriter:
             )
         if self._codec == CODEC_TABLE and np.unique(frame.depth_mm).size > MAX_DISTINCT:
             self._start_plain()
+        if frame.colour is not None:
+            self._write_colour(frame.colour, frame.colour_us or 0)
         payload = encode_depth(frame.depth_mm) if self._codec == CODEC_TABLE else frame.depth_mm.astype("<u2").tobytes()
         self._writer.add_frame(1, since_us, payload)
+
+    def _write_colour(self, colour: ColourArray, time_us: int) -> None:
+        first = self._first
+        assert first is not None
+        if first.colour is None or first.colour.shape != colour.shape:
+            self.colourless += 1
+        elif self._colour_us is None or time_us > self._colour_us:  # else it stands in the file already
+            self._colour_us = time_us
+            self._writer.add_frame(2, time_us - self._first_us, jpeg_of(colour, JPEG_QUALITY))
 
     def read_back(self) -> DepthArray | None:
         """The last frame as it stands in the file; None if it cannot be decoded."""
@@ -275,32 +301,41 @@ class OniWriter:
                 " write a folder of PNG frames"
             )
         self._camera = camera
-        self._first_us = frame.timestamp_us
-        self._add_depth(camera)
+        self._first = frame
+        self._first_us = min(frame.timestamp_us, frame.timestamp_us if frame.colour_us is None else frame.colour_us)
+        self._add_nodes(frame)
 
-    def _add_depth(self, camera: Camera) -> None:
+    def _add_nodes(self, first: DepthFrame) -> None:
         depth = NodeAddition("Depth", NodeType.DEPTH, self._codec, None, 0)
-        self._writer.add_node(1, depth, depth_properties(camera, self._fps))
+        more = {REGISTERED: integer(int(first.registered))} if first.colour is not None else {}
+        self._writer.add_node(1, depth, depth_properties(first.camera, self._fps) | more)
+        if first.colour is not None:
+            image = NodeAddition("Image", NodeType.IMAGE, CODEC_JPEG, None, 0)
+            self._writer.add_node(2, image, colour_properties(first, self._fps))
         self._writer.begin()
 
     def _start_plain(self) -> None:
         """Write what is there again, uncompressed."""
-        from selective_depth.drivers.oni.reader import OniReader
+        from selective_depth.drivers.oni.inspection import inspect_oni
 
-        assert self._camera is not None
+        assert self._first is not None
         path = self._writer.path
         self._codec = CODEC_NONE
-        written, compressed = self._writer.payload_size > 0, path.with_name(f"{path.name}.part")
+        compressed = path.with_name(f"{path.name}.part")
         self._writer.close()
         path.replace(compressed)
         try:
             self._writer = RecordWriter(path, keep=self._keep)
-            self._add_depth(self._camera)
-            if written:
-                with OniReader(compressed) as frames:
-                    for frame in frames:
-                        plain = frame.depth_mm.astype("<u2").tobytes()
-                        self._writer.add_frame(1, frame.timestamp_us, plain)
+            self._add_nodes(self._first)
+            frames = [(node, frame) for node in inspect_oni(compressed).nodes for frame in node.frames]
+            with compressed.open("rb") as file:
+                for node, frame in sorted(frames, key=lambda item: item[1].record_offset):
+                    payload = read_payload(file, frame)
+                    if node.node_type == NodeType.DEPTH:
+                        depth_mm = decode_depth(CODEC_TABLE, payload, *self._first.shape)
+                        assert depth_mm is not None  # encoded here
+                        payload = depth_mm.astype("<u2").tobytes()
+                    self._writer.add_frame(node.number, frame.timestamp_us, payload)
         finally:
             compressed.unlink(missing_ok=True)
 
@@ -343,6 +378,7 @@ def depth_properties(camera: Camera, fps: float) -> dict[str, Property]:
     whole_fps = min(max(round(fps), 1), 1000)
     fov_x_rad = 2 * math.atan(width / (2 * camera.fx))
     fov_y_rad = 2 * math.atan(height / (2 * camera.fy))
+    own = {CAMERA: structure("<dddd", camera.fx, camera.fy, camera.cx, camera.cy)}
     return {
         "oniRequiredFrameSize": integer(2 * width * height),
         "xnIsGenerating": integer(1),
@@ -353,9 +389,26 @@ def depth_properties(camera: Camera, fps: float) -> dict[str, Property]:
         "xnPixelFormat": integer(_GREY_16_BIT),
         "oniPixelFormat": integer(_DEPTH_1_MM),
         "xnFOV": structure("<dd", fov_x_rad, fov_y_rad),
+        **(own if abs(camera.cx - width / 2) + abs(camera.cy - height / 2) > 0.01 else {}),
         "Cropping": integer(1),
         # Without this one OpenNI2 opens the file but delivers no frame.
         "xnCropping": structure("<IHHHH", 0, 0, 0, 0, 0),
         "Mirror": integer(1),
         "xnMirror": integer(0),
+    }
+
+
+def colour_properties(first: DepthFrame, fps: float) -> dict[str, Property]:
+    """The same of the colour stream of a first frame; an unknown camera is not told."""
+    assert first.colour is not None
+    height, width = first.colour.shape[:2]
+    known = first.colour_camera or replace(first.camera, width=width, height=height)
+    said = depth_properties(known, fps)
+    del said["xnDeviceMaxDepth"]
+    if first.colour_camera is None:
+        said = {name: value for name, value in said.items() if name not in (CAMERA, "xnFOV")}
+    return said | {
+        "oniRequiredFrameSize": integer(3 * width * height),
+        "xnPixelFormat": integer(_RGB_24_BIT),
+        "oniPixelFormat": integer(_RGB_888),
     }

@@ -6,8 +6,10 @@ import re
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 
+from selective_depth.drivers.colour import ON, Colouring
 from selective_depth.drivers.errors import (
     DeviceLostError,
     DeviceRefusedError,
@@ -16,8 +18,10 @@ from selective_depth.drivers.errors import (
     SourceNotFoundError,
     SourceTimeoutError,
 )
-from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.oni.form import upright
+from selective_depth.drivers.openni.clock import Count
+from selective_depth.drivers.openni.pairing import Pairing
 from selective_depth.drivers.openni.process import Message, Worker, camera_of, error_of
 from selective_depth.drivers.openni.sensors import DeviceInfo
 from selective_depth.drivers.options import Options
@@ -35,6 +39,8 @@ _NO_FRAMES = (
     " check its power supply; in a virtual machine, hand on the whole USB controller."
 )
 _GRACE_S = 1.0  # for a worker to stop the sensor before it is killed
+_PAIR_S = 0.01  # how soon a frame that waits for its colour is handed on without
+_COLOUR_KEYS = (("width", "height"), ("fov_x_rad", "fov_y_rad"))
 _BEAT_S = 0.1  # how soon the supervisor notices that it should end
 
 
@@ -53,7 +59,10 @@ class DeviceSettings:
     nearest : bool, default False
         Where it has no such mode, take the one that is nearest to it.
     registration : bool, default False
-        Depth registered to the sensor's colour camera, where it can.
+        Depth registered to the sensor's colour camera, or refused; where there is colour it is
+        registered in any case if it can be.
+    colour : bool, default True
+        Deliver colour beside depth, where the sensor has it.
     first_frame_s : float, default 10
         How long a sensor may take for its first frame; later on it is opened afresh after 3 s.
     """
@@ -65,10 +74,11 @@ class DeviceSettings:
     nearest: bool = False
     registration: bool = False
     first_frame_s: float = 10.0
+    colour: bool = True
 
 
-def parse_address(text: str) -> tuple[str, DeviceSettings | None, tuple[float, ...] | None]:
-    """Address, settings and intrinsics of a sensor's name with options, ``ADDRESS?mode=640x480@30``.
+def parse_address(text: str) -> tuple[str, DeviceSettings, tuple[float, ...] | None, Colouring]:
+    """What a sensor's name with options says, ``ADDRESS?mode=640x480@30``: address, settings, intrinsics, colour.
 
     Raises
     ------
@@ -76,50 +86,13 @@ def parse_address(text: str) -> tuple[str, DeviceSettings | None, tuple[float, .
         If an option is unknown or wrong.
     """
     # An address may have a '?' of its own.
-    address, query = [*re.split(r"\?(?=(?:mode|camera|scale|topic|stream)=)", text, maxsplit=1), ""][:2]
+    address, query = [*re.split(r"\?(?=(?:mode|camera|scale|topic|stream|colour)=)", text, maxsplit=1), ""][:2]
     options = Options(query, f"the sensor '{address}'")
     mode = [int(each) for each in options.numbers("mode", "WIDTHxHEIGHT@FPS", 1, 1e5, r"x|@") or ()]
-    intrinsics = options.camera()
+    intrinsics, colouring = options.camera(), Colouring.of(options)
     options.done()
-    return address, DeviceSettings(mode[0], mode[1], mode[2]) if mode else None, intrinsics
-
-
-class _Count:
-    """Numbers and timestamps that go on rising when the sensor starts its own again."""
-
-    def __init__(self) -> None:
-        self._number = -1
-        self._timestamp_us = 0
-        self._seen_s = time.monotonic()
-        self._add_number = 0
-        self._add_us = 0
-        self._fresh = True
-        self.mended = 0
-
-    def restart(self) -> None:
-        """The next frame is the first of another run of the sensor."""
-        self._fresh = True
-
-    def follow(self, message: Message) -> tuple[int, int]:
-        """Number and timestamp of a frame in the life of this source."""
-        index, timestamp_us = int(message["index"]), int(message["timestamp_us"])
-        now = time.monotonic()
-        renumbered = self._fresh or index + self._add_number <= self._number
-        if renumbered:
-            self._add_number = self._number + 1 - index
-        # The outage takes as long on our clock as it took on the wall.
-        away_us = max(round((now - self._seen_s) * 1e6), 1)
-        step_us = timestamp_us + self._add_us - self._timestamp_us
-        # A clock that stands, wraps round or counts milliseconds.
-        wrong = step_us <= 0 or (away_us < 500_000 and step_us * 50 < away_us)
-        if self._number >= 0 and (self._fresh or wrong):
-            self.mended += not self._fresh
-            self._add_us = self._timestamp_us + away_us - timestamp_us
-        self._fresh = False
-        self._seen_s = now
-        self._number = index + self._add_number
-        self._timestamp_us = timestamp_us + self._add_us
-        return self._number, self._timestamp_us
+    settings = DeviceSettings(mode[0], mode[1], mode[2]) if mode else DeviceSettings(nearest=True)
+    return address, replace(settings, colour=colouring.wanted), intrinsics, colouring
 
 
 class OpenNIDevice(DepthSource):
@@ -149,6 +122,8 @@ class OpenNIDevice(DepthSource):
 
     intrinsics : (float, float, float, float), optional
         fx, fy, cx, cy in pixels; default from the field of view that the driver states.
+    colouring : Colouring, optional
+        What is known of its colour; default what the driver states.
 
     Attributes
     ----------
@@ -184,6 +159,7 @@ class OpenNIDevice(DepthSource):
         *,
         tap: Callable[[DepthFrame], None] | None = None,
         intrinsics: tuple[float, ...] | None = None,
+        colouring: Colouring = ON,
     ) -> None:
         self.uri = f"openni:{device_uri}" if device_uri else "openni"
         self.settings = settings or DeviceSettings(nearest=True)
@@ -200,7 +176,7 @@ class OpenNIDevice(DepthSource):
         self._first: int | None = None
         self._first_number = 0
         self._next_number: int | None = None
-        self._count = _Count()
+        self._count = Count()
         self._attempts = 0
         started = time.monotonic()
         self._worker, about = self._open(_OPEN_S, None)
@@ -211,11 +187,19 @@ class OpenNIDevice(DepthSource):
         self.camera = camera
         self.fps = float(about["fps"])
         self._tenths = bool(about["tenths"])
+        self._colour: Message | None = about["colour"]
+        if self._colour is not None:
+            with suppress(ValueError):
+                size, angles = ((self._colour[name] for name in names) for names in _COLOUR_KEYS)
+                seen = Camera.from_fov(*size, *angles)
+                colouring = colouring.told_by((seen.fx, seen.fy, seen.cx, seen.cy), None)
+        self._pairing = Pairing(self._colour is not None, bool(about["registered"]), colouring)
         wanted = (self.settings.width, self.settings.height, self.settings.fps)
         taken = (camera.width, camera.height, int(about["fps"]))
         if taken != wanted:
             text = "it has no {}x{}@{}; {}x{}@{} is taken, and --mode takes another"
             notes += (text.format(*wanted, *taken),)
+        notes += (about["colour_trouble"],) if about["colour_trouble"] else ()
         self.notes = tuple(f"{self.uri}: {note}." for note in notes)
         self._doubt_identity(about)
         self._supervisor = threading.Thread(target=self._supervise, name="openni-supervisor", daemon=True)
@@ -341,9 +325,11 @@ class OpenNIDevice(DepthSource):
         misfits = unheard = 0
         silence_s = max(self.settings.first_frame_s, _RESTART_S)
         while not self._closing.is_set():
-            message = self._worker.receive(_BEAT_S)
+            message = self._worker.receive(_PAIR_S if self._pairing.waits else _BEAT_S)
+            if message is None:  # else colour may be what comes now
+                self._hand_on(self._pairing.late())
             # Beats, not the clock: if this process was held up, it is not the worker's fault.
-            unheard = unheard + 1 if message is None else 0
+            unheard = unheard + 1 if message is None and not self._pairing.waits else 0
             if message is None:
                 if unheard * _BEAT_S > _HANG_S:
                     self._worker.close()  # at once: it would not stop the sensor any more
@@ -351,6 +337,10 @@ class OpenNIDevice(DepthSource):
             elif message["kind"] == "frame":
                 misfits, silence_s = 0, _RESTART_S
                 self._arrive(message)
+            elif message["kind"] == "colour":
+                self._colour_arrives(message)
+            elif message["kind"] == "odd_colour":
+                self._note_once(f"its colour is left out: {message['problem']}")
             elif message["kind"] == "misfit":
                 misfits += 1
                 self.misfits += 1
@@ -385,16 +375,36 @@ class OpenNIDevice(DepthSource):
                 f"{self.uri}: its clock stands, jumps back or does not count microseconds; this"
                 " computer's tells the times instead.",
             )
-        if self._first is None:
-            self._first = number
-        frame = DepthFrame(depth_mm, number - self._first, timestamp_us, self.camera, self.uri)
-        if self._tap is not None:
-            self._tap(frame)
+        frame = DepthFrame(depth_mm, number, timestamp_us, self.camera, self.uri)
         self._attempts = 0
-        with self._changed:
-            self.state, self.state_reason = "live", ""
-            self._newest = frame
-            self._changed.notify_all()
+        self._hand_on(self._pairing.depth(frame, int(message["timestamp_us"])))
+
+    def _colour_arrives(self, message: Message) -> None:
+        assert self._colour is not None
+        colour = self._worker.take_colour(message, self._colour)
+        if colour is not None:
+            colour = colour[:, ::-1] if self.settings.mirror else colour
+            self._hand_on(self._pairing.colour(colour, int(message["timestamp_us"])))
+
+    def _hand_on(self, frames: list[DepthFrame]) -> None:
+        """Frames that are complete go to whoever waits for one."""
+        for frame in frames:
+            if self._pairing.trouble:
+                self._note_once(self._pairing.trouble)
+            if self._first is None:
+                self._first = frame.index
+            frame = replace(frame, index=frame.index - self._first)
+            if self._tap is not None:
+                self._tap(frame)
+            with self._changed:
+                self.state, self.state_reason = "live", ""
+                self._newest = frame
+                self._changed.notify_all()
+
+    def _note_once(self, sentence: str) -> None:
+        note = f"{self.uri}: {sentence}."
+        if note not in self.notes:
+            self.notes += (note,)
 
     def _reopen(self) -> None:
         """Open the sensor again, trying for as long as it takes."""
@@ -410,4 +420,6 @@ class OpenNIDevice(DepthSource):
             else:
                 self.restarts += 1
                 self._count.restart()
+                self._colour = about["colour"]
+                self._pairing.restart()
                 return

@@ -19,16 +19,17 @@ from typing import Any
 
 import numpy as np
 
+from selective_depth.drivers.colour import rgb_of
 from selective_depth.drivers.errors import SourceError
-from selective_depth.drivers.frame import Camera, DepthArray
+from selective_depth.drivers.frame import Camera, ColourArray, DepthArray
 from selective_depth.drivers.openni.runtime import find_runtime
 from selective_depth.drivers.openni.usb import usb_advice
 
 Message = dict[str, Any]
 """What the worker says; its ``kind`` tells what else is in it."""
 
-_SLOTS = 12  # 0.4 s of frames, for one that records on a busy machine
-_SLOT_BYTES = 1280 * 1024 * 2  # more than any sensor of this kind has; unused pages cost none
+_SLOTS = 24  # 0.4 s of depth and colour, for one that records on a busy machine
+_SLOT_BYTES = 1920 * 1080 * 3  # more than any sensor of this kind has; unused pages cost none
 _ERRORS = {kind.__name__: kind for kind in SourceError.__subclasses__()}
 
 
@@ -131,6 +132,14 @@ class Worker:
         image = pixels.reshape(height, width).copy()
         self._tell(f"free {frame['slot']}")
         return image
+
+    def take_colour(self, image: Message, about: Message) -> ColourArray | None:
+        """The same of a ``colour`` message's image, as red, green and blue."""
+        data = memoryview(self._memory)[image["slot"] * _SLOT_BYTES :][:_SLOT_BYTES]
+        with data:
+            colour = rgb_of(data, about["form"], about["width"], about["height"])
+        self._tell(f"free {image['slot']}")
+        return colour
 
     def close(self, grace_s: float = 0.0) -> None:
         """End the process: let it finish for so long, then kill it. Harmless when called twice."""

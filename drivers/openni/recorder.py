@@ -79,7 +79,7 @@ def record(
     SourceNotFoundError, RuntimeMissingError, DeviceRefusedError
         As for `OpenNIDevice`.
     """
-    address, asked, intrinsics = parse_address(device_uri)
+    address, asked, intrinsics, colouring = parse_address(device_uri)
     recorder = OniRecorder(out_path, overwrite=overwrite)
     taken = made = 0
 
@@ -98,7 +98,7 @@ def record(
             progress(told)
 
     try:
-        with OpenNIDevice(address, settings or asked, tap=take, intrinsics=intrinsics) as device:
+        with OpenNIDevice(address, settings or asked, tap=take, intrinsics=intrinsics, colouring=colouring) as device:
             started = time.monotonic()
             recorder.fps = device.fps
             try:

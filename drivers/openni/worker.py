@@ -32,6 +32,8 @@ WAIT_S = 0.2  # longest uninterrupted wait for a frame, and the beat of "idle" m
 SETTLE_S = 0.05  # between stop and close: the runtime's threads set their flags late
 MILLIMETRES = int(openni2.PIXEL_FORMAT_DEPTH_1_MM)
 UNITS = {MILLIMETRES: "mm", 101: "0.1 mm"}
+COLOURS = {200: ("RGB888", 3), 201: ("YUV422", 2), 205: ("YUYV", 2), 202: ("GRAY8", 1)}
+"""Pixel formats of colour streams, the best first, with their bytes a pixel."""
 
 
 class Device(openni2.Device):  # type: ignore[misc]
@@ -184,6 +186,9 @@ class LiveStream:
         same = [each["uri"] for each in there if (each["vendor"], each["name"]) == kind]
         self.twins = len({address.partition("?")[0] for address in same}) > 1
         uri = info["uri"]
+        self.colour: Any = None
+        self.colour_trouble = ""
+        self.registered = False
         if not self.device.has_sensor(openni2.SENSOR_DEPTH):
             raise JobError("DeviceRefusedError", f"The sensor {uri} has no depth camera.")
         try:
@@ -194,6 +199,35 @@ class LiveStream:
                 "DeviceRefusedError",
                 f"The sensor {uri} refuses a depth stream: {reason(error)}. Pull it out and plug it in again.",
             ) from error
+        if job["settings"]["colour"]:
+            self._open_colour()
+
+    def _open_colour(self) -> None:
+        """Add the colour stream, where there is one that can be read; depth needs none."""
+        depth = mode_key(self.stream.get_video_mode())
+        with suppress(OpenNIError):
+            if not self.device.has_sensor(openni2.SENSOR_COLOR):
+                return
+        try:
+            modes = list(self.device.get_sensor_info(openni2.SENSOR_COLOR).videoModes)
+            order = list(COLOURS)
+            known = [mode for mode in modes if mode_key(mode)[3] in order]
+            if not known:
+                self.colour_trouble = (
+                    f"its colour is in none of the forms that are read: {'; '.join(map(mode_text, modes))}"
+                )
+                return
+            mode = min(known, key=lambda m: (_distance(mode_key(m), depth)[0], order.index(mode_key(m)[3]), -m.fps))
+            stream = self.device.create_color_stream()
+            if mode_key(stream.get_video_mode()) != mode_key(mode):
+                stream.set_video_mode(mode)
+            with suppress(OpenNIError):
+                if stream.is_property_supported(c_api.ONI_STREAM_PROPERTY_MIRRORING) and stream.get_mirroring_enabled():
+                    stream.set_mirroring_enabled(False)
+            self._register(True, needed=False)
+            self.colour = stream
+        except OpenNIError as error:
+            self.colour_trouble = f"its colour stream is refused: {reason(error)}"
 
     def _open(self) -> None:
         uri = self.info["uri"]
@@ -243,7 +277,7 @@ class LiveStream:
                 stream.set_mirroring_enabled(False)
         self._register(settings["registration"])
 
-    def _register(self, wanted: bool) -> None:
+    def _register(self, wanted: bool, needed: bool = True) -> None:
         device = self.device
         mode = openni2.IMAGE_REGISTRATION_DEPTH_TO_COLOR if wanted else openni2.IMAGE_REGISTRATION_OFF
         known = False
@@ -253,7 +287,8 @@ class LiveStream:
             ) and device.is_image_registration_mode_supported(mode)
             if known and device.get_image_registration_mode() != mode:
                 device.set_image_registration_mode(mode)
-        if wanted and not known:
+        self.registered = wanted and known
+        if wanted and needed and not known:
             raise JobError(
                 "DeviceRefusedError", f"The sensor {self.info['uri']} cannot register depth to its colour camera."
             )
@@ -268,18 +303,30 @@ class LiveStream:
                 f"The sensor {self.info['uri']} does not start: {reason(error)}. Check its power"
                 " supply, pull it out and plug it in again.",
             ) from error
+        try:
+            if self.colour is not None:
+                self.colour.start()
+        except OpenNIError as error:
+            self.colour, self.colour_trouble = None, f"its colour stream does not start: {reason(error)}"
+
+    @property
+    def streams(self) -> list[Any]:
+        """Depth, and colour where there is some."""
+        return [self.stream] if self.colour is None else [self.stream, self.colour]
 
     def close(self) -> None:
         """Release the sensor, in the one order that does not crash."""
-        self.stream.stop()
+        for stream in self.streams:
+            stream.stop()
         time.sleep(SETTLE_S)
-        self.stream.close()
+        for stream in self.streams:
+            stream.close()
         self.device.close()
         openni2.unload()
 
 
 def describe(stream: Any) -> dict[str, Any]:
-    """What the parent needs to know of a depth stream."""
+    """What the parent needs to know of a stream."""
     mode = stream.get_video_mode()
     try:
         fov_rad = stream.get_horizontal_fov(), stream.get_vertical_fov()
@@ -287,6 +334,7 @@ def describe(stream: Any) -> dict[str, Any]:
         fov_rad = (0.0, 0.0)  # not every driver knows it
     return {
         "tenths": int(mode.pixelFormat) == 101,
+        "form": COLOURS.get(int(mode.pixelFormat), ("", 2))[0],
         "width": mode.resolutionX,
         "height": mode.resolutionY,
         "fps": mode.fps,
@@ -295,25 +343,26 @@ def describe(stream: Any) -> dict[str, Any]:
     }
 
 
-def next_frame(stream: Any) -> Any | None:
-    """The next frame, to be closed by the caller; None if none comes for a while."""
-    if openni2.wait_for_any_stream([stream], WAIT_S) is None:
-        return None
-    return stream.read_frame()
+def next_frame(streams: list[Any]) -> tuple[Any, Any] | None:
+    """The next frame, to be closed by the caller, and its stream; None if none comes for a while."""
+    stream = openni2.wait_for_any_stream(streams, WAIT_S)
+    return None if stream is None else (stream.read_frame(), stream)
 
 
 def misfit(frame: Any, about: dict[str, Any]) -> str:
     """What is wrong with a frame's size or format; empty if nothing. Rows may be padded."""
-    width, height = about["width"], about["height"]
-    least = (height - 1) * frame.stride + width * 2
-    fits = frame.stride >= width * 2 and frame.dataSize >= least
+    width, height, kind = about["width"], about["height"], int(frame.videoMode.pixelFormat)
+    row = width * COLOURS.get(kind, ("", 2))[1]
+    least = (height - 1) * frame.stride + row
+    fits = frame.stride >= row and frame.dataSize >= least
     if (frame.width, frame.height) != (width, height) or not fits:
         got = (frame.width, frame.height, frame.stride, frame.dataSize)
         return "it is {}x{} (stride {}, {} bytes), expected {}x{} (stride {}, {} bytes)".format(
-            *got, width, height, width * 2, width * height * 2
+            *got, width, height, row, row * height
         )
-    if int(frame.videoMode.pixelFormat) != (101 if about["tenths"] else MILLIMETRES):
-        return f"it is {mode_text(frame.videoMode)}, expected depth in mm"
+    wanted = (101 if about["tenths"] else MILLIMETRES) if not about["form"] else kind
+    if kind != wanted or COLOURS.get(kind, ("", 2))[0] != about["form"]:
+        return f"it is {mode_text(frame.videoMode)}, expected {about['kind'] or 'depth in mm'}"
     return ""
 
 
@@ -331,10 +380,12 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
     initialize(job)
     slots = Slots(job, parent)
     live = LiveStream(job, parent)
-    about = describe(live.stream)
     live.start()
-    parent.send("opened", device=live.info, twins=live.twins, **about)
-    width, height = about["width"], about["height"]
+    about = [describe(stream) for stream in live.streams]
+    colour = dict(enumerate(about)).get(1)
+    told = {"colour": colour, "colour_trouble": live.colour_trouble, "registered": live.registered}
+    parent.send("opened", device=live.info, twins=live.twins, **about[0], **told)
+    width, height = about[0]["width"], about[0]["height"]
     if not slots.fits(width * height * 2):
         raise JobError("DeviceRefusedError", f"Frames of {width}x{height} pixels are too large.")
     last_frame = time.monotonic()
@@ -342,22 +393,31 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
         if live.watch.lost.is_set():
             parent.send("lost")
             break
-        frame = next_frame(live.stream)
-        if frame is None or frame.dataSize == 0:  # a transfer that carried nothing
-            parent.send("idle", silent_s=time.monotonic() - last_frame)
-            if frame is not None:
-                frame.close()
-            continue
-        last_frame = time.monotonic()
-        problem = misfit(frame, about)
-        slot = None if problem else slots.take()
-        if slot is not None:
-            slots.fill(slot, frame.data, width * 2, frame.stride, height)
-            parent.send("frame", slot=slot, index=frame.frameIndex, timestamp_us=frame.timestamp)
-        elif problem:
-            parent.send("misfit", problem=problem)
-        frame.close()
+        found = next_frame(live.streams)
+        frame, is_depth = (None, True) if found is None else (found[0], found[1] is live.stream)
+        now = time.monotonic()
+        if is_depth and frame is not None and frame.dataSize > 0:
+            last_frame = now
+        elif frame is None or is_depth or now - last_frame > WAIT_S:  # a transfer that carried nothing, or only colour
+            parent.send("idle", silent_s=now - last_frame)
+        if frame is not None:
+            if frame.dataSize > 0:
+                deliver(frame, about[0 if is_depth else 1], slots, parent, "frame" if is_depth else "colour")
+            frame.close()
     live.close()
+
+
+def deliver(frame: Any, about: dict[str, Any], slots: Slots, parent: Parent, what: str) -> None:
+    """Put a frame into shared memory and say so; a colour image that does not fit is left out."""
+    problem = misfit(frame, about)
+    row = about["width"] * COLOURS.get(int(frame.videoMode.pixelFormat), ("", 2))[1]
+    if problem or not slots.fits(row * about["height"]):
+        parent.send("misfit" if what == "frame" else "odd_colour", problem=problem or "it is too large")
+        return
+    slot = slots.take()
+    if slot is not None:
+        slots.fill(slot, frame.data, row, frame.stride, about["height"])
+        parent.send(what, slot=slot, index=frame.frameIndex, timestamp_us=frame.timestamp)
 
 
 JOBS = {"list": run_list, "device": run_device}

@@ -35,6 +35,17 @@ hang_start,
 hang_stop
 crash              0         1: segmentation fault in the driver
 frames             none      file of raw uint16 images, played round and round
+colour             none      file of raw colour images, in step with them
+colour_width,      as depth  size of its largest mode
+colour_height
+colour_format      200       OpenNI2's number of its pixel format (RGB888)
+colour_first_ms    50        how long its first image takes
+colour_late_us     0         how much later than depth it is stamped
+stall_colour       0         1: no colour images, and no error either
+odd_colour         0         1: colour images of half the height
+refuse_colour,     0         1: that call fails
+refuse_colour_start
+registers          0         1: the sensor can register depth to colour
 =================  ========  ==================================================================
 """
 
@@ -93,11 +104,19 @@ class VirtualSensor:
         An empty folder to make it in.
     frames : uint16 array of shape (n, height, width), optional
         What the sensor sees, played round and round; default all zero.
+    colour : uint8 array of shape (n, height, width, 3), optional
+        What its colour camera sees; default it has none.
     **keys
         First settings, as for `set`.
     """
 
-    def __init__(self, folder: Path, frames: npt.NDArray[np.uint16] | None = None, **keys: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        frames: npt.NDArray[np.uint16] | None = None,
+        colour: npt.NDArray[np.uint8] | None = None,
+        **keys: int,
+    ) -> None:
         library = _system_library()
         self.runtime = folder / "runtime"
         drivers = self.runtime / "OpenNI2" / "Drivers"
@@ -111,6 +130,9 @@ class VirtualSensor:
             file = folder / "frames.raw"
             frames.astype(np.uint16).tofile(file)
             self._keys |= {"frames": file, "height": frames.shape[1], "width": frames.shape[2]}
+        if colour is not None:
+            (folder / "colour.raw").write_bytes(colour.tobytes())
+            self._keys["colour"] = folder / "colour.raw"
         self.set(**keys)
 
     @property

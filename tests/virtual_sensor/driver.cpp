@@ -258,15 +258,142 @@ private:
     long made_ = 0;
 };
 
+std::vector<OniVideoMode> colour_modes() {
+    const int width = control().number("colour_width", control().number("width", 640));
+    const int height = control().number("colour_height", control().number("height", 480));
+    const auto format = OniPixelFormat(control().number("colour_format", ONI_PIXEL_FORMAT_RGB888));
+    return {{format, width / 2, height / 2, 30}, {format, width, height, 30}};
+}
+
+// Colour beside depth: its file of raw images goes round in step with that of depth.
+class ColourStream : public oni::driver::StreamBase {
+public:
+    ColourStream() : mode_(colour_modes().front()) {}
+    ~ColourStream() override { stop(); }
+
+    OniStatus start() override {
+        if (control().on("refuse_colour_start")) return ONI_STATUS_ERROR;
+        std::ifstream file(control().text("colour"), std::ios::binary | std::ios::ate);
+        frames_.resize(file ? size_t(file.tellg()) : 0);
+        file.seekg(0);
+        file.read(frames_.data(), std::streamsize(frames_.size()));
+        running_ = true;
+        thread_ = std::thread([this] { run(); });
+        return ONI_STATUS_OK;
+    }
+
+    void stop() override {
+        running_ = false;
+        if (thread_.joinable()) thread_.join();
+    }
+
+    size_t row_bytes() const {
+        const int kind = mode_.pixelFormat;
+        return size_t(mode_.resolutionX) * (kind == ONI_PIXEL_FORMAT_RGB888 ? 3 : kind == ONI_PIXEL_FORMAT_GRAY8 ? 1 : 2);
+    }
+    int getRequiredFrameSize() override { return int(row_bytes()) * mode_.resolutionY; }
+
+    OniBool isPropertySupported(int id) override {
+        return id == ONI_STREAM_PROPERTY_HORIZONTAL_FOV || id == ONI_STREAM_PROPERTY_VERTICAL_FOV ||
+               id == ONI_STREAM_PROPERTY_VIDEO_MODE || id == ONI_STREAM_PROPERTY_STRIDE ||
+               id == ONI_STREAM_PROPERTY_CROPPING || id == ONI_STREAM_PROPERTY_MIRRORING;
+    }
+
+    OniStatus getProperty(int id, void* data, int* size) override {
+        switch (id) {
+        case ONI_STREAM_PROPERTY_CROPPING: return answer(OniCropping{}, data, size);
+        case ONI_STREAM_PROPERTY_MIRRORING: return answer(OniBool(FALSE), data, size);
+        case ONI_STREAM_PROPERTY_HORIZONTAL_FOV: return answer(float(kFovX), data, size);
+        case ONI_STREAM_PROPERTY_VERTICAL_FOV: return answer(float(kFovY), data, size);
+        case ONI_STREAM_PROPERTY_VIDEO_MODE: return answer(mode_, data, size);
+        case ONI_STREAM_PROPERTY_STRIDE: return answer(int(row_bytes()), data, size);
+        default: return ONI_STATUS_NOT_SUPPORTED;
+        }
+    }
+
+    OniStatus setProperty(int id, const void* data, int size) override {
+        if (id == ONI_STREAM_PROPERTY_CROPPING) return ONI_STATUS_OK;
+        if (id != ONI_STREAM_PROPERTY_VIDEO_MODE || size != int(sizeof(OniVideoMode))) return ONI_STATUS_NOT_SUPPORTED;
+        for (const auto& mode : colour_modes())
+            if (std::memcmp(&mode, data, sizeof mode) == 0) {
+                mode_ = mode;
+                return ONI_STATUS_OK;
+            }
+        return ONI_STATUS_NOT_SUPPORTED;
+    }
+
+    void notifyAllProperties() override {
+        raisePropertyChanged(ONI_STREAM_PROPERTY_VIDEO_MODE, &mode_, sizeof mode_);
+    }
+
+private:
+    void run() {
+        auto due = Clock::now() + Milliseconds(control().number("colour_first_ms", 50));
+        while (running_) {
+            const auto left = due - Clock::now();
+            if (left > Clock::duration::zero()) {
+                std::this_thread::sleep_for(std::min<Clock::duration>(left, Milliseconds(5)));
+                continue;
+            }
+            due = std::max(due + std::chrono::microseconds(1000000 / control().number("fps", 30)),
+                           Clock::now() - Milliseconds(100));
+            const long limit = control().number("limit", -1);
+            if (!control().on("connected") || control().on("stall") || (limit >= 0 && made_ >= limit)) continue;
+            if (control().on("stall_colour"))
+                ++made_; // its clock goes on
+            else
+                deliver();
+        }
+    }
+
+    void deliver() {
+        OniFrame* frame = getServices().acquireFrame();
+        if (!frame) return;
+        const size_t size = row_bytes() * mode_.resolutionY, count = frames_.size() / size;
+        if (count) std::memcpy(frame->data, frames_.data() + (made_ % count) * size, size);
+        const int rows = mode_.resolutionY / (control().on("odd_colour") ? 2 : 1);
+        frame->sensorType = ONI_SENSOR_COLOR;
+        frame->frameIndex = int(++made_);
+        frame->timestamp = uint64_t(made_) * 1000000 / 30 + control().number("colour_late_us", 0);
+        frame->videoMode = mode_;
+        frame->width = mode_.resolutionX;
+        frame->height = rows;
+        frame->stride = int(row_bytes());
+        frame->dataSize = rows * frame->stride;
+        frame->croppingEnabled = FALSE;
+        frame->cropOriginX = frame->cropOriginY = 0;
+        raiseNewFrame(frame);
+        getServices().releaseFrame(frame);
+    }
+
+    OniVideoMode mode_;
+    std::atomic<bool> running_{false};
+    std::thread thread_;
+    std::vector<char> frames_;
+    long made_ = 0;
+};
+
 class Device : public oni::driver::DeviceBase {
 public:
-    Device(int lock, char number) : lock_(lock), number_(number), modes_(offered_modes()) {}
+    Device(int lock, char number)
+        : lock_(lock), number_(number), modes_(offered_modes()), colour_modes_(colour_modes()) {}
     ~Device() override { close(lock_); }
 
     OniBool isPropertySupported(int id) override {
-        return id == ONI_DEVICE_PROPERTY_SERIAL_NUMBER && !serial().empty();
+        return (id == ONI_DEVICE_PROPERTY_SERIAL_NUMBER && !serial().empty()) ||
+               (id == ONI_DEVICE_PROPERTY_IMAGE_REGISTRATION && control().on("registers"));
+    }
+    OniBool isImageRegistrationModeSupported(OniImageRegistrationMode mode) override {
+        return mode == ONI_IMAGE_REGISTRATION_OFF || control().on("registers");
+    }
+    OniStatus setProperty(int id, const void* data, int size) override {
+        if (id != ONI_DEVICE_PROPERTY_IMAGE_REGISTRATION || size != int(sizeof(int))) return ONI_STATUS_NOT_SUPPORTED;
+        registration_ = *static_cast<const int*>(data);
+        return ONI_STATUS_OK;
     }
     OniStatus getProperty(int id, void* data, int* size) override {
+        if (id == ONI_DEVICE_PROPERTY_IMAGE_REGISTRATION && control().on("registers"))
+            return answer(registration_, data, size);
         if (!isPropertySupported(id) || *size <= int(serial().size())) return ONI_STATUS_NOT_SUPPORTED;
         std::memcpy(data, serial().c_str(), serial().size() + 1);
         *size = int(serial().size()) + 1;
@@ -274,13 +401,15 @@ public:
     }
 
     OniStatus getSensorInfoList(OniSensorInfo** sensors, int* count) override {
-        info_ = {ONI_SENSOR_DEPTH, int(modes_.size()), modes_.data()};
-        *sensors = &info_;
-        *count = 1;
+        info_[0] = {ONI_SENSOR_DEPTH, int(modes_.size()), modes_.data()};
+        info_[1] = {ONI_SENSOR_COLOR, int(colour_modes_.size()), colour_modes_.data()};
+        *sensors = info_;
+        *count = control().text("colour").empty() ? 1 : 2;
         return ONI_STATUS_OK;
     }
 
     oni::driver::StreamBase* createStream(OniSensorType type) override {
+        if (type == ONI_SENSOR_COLOR && !control().on("refuse_colour")) return new ColourStream();
         if (type != ONI_SENSOR_DEPTH || control().on("refuse_stream")) return nullptr;
         return new DepthStream();
     }
@@ -292,7 +421,9 @@ private:
     int lock_;
     char number_;
     std::vector<OniVideoMode> modes_;
-    OniSensorInfo info_{};
+    std::vector<OniVideoMode> colour_modes_;
+    OniSensorInfo info_[2] = {};
+    int registration_ = ONI_IMAGE_REGISTRATION_OFF;
 };
 
 class VirtualDriver : public oni::driver::DriverBase {

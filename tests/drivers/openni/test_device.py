@@ -28,7 +28,7 @@ from selective_depth.drivers.errors import (
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.openni import DeviceInfo, DeviceSettings, OpenNIDevice, list_devices, runtime_version
-from selective_depth.drivers.openni.device import _Count
+from selective_depth.drivers.openni.clock import Count
 from selective_depth.drivers.openni.process import Message
 
 pytestmark = pytest.mark.openni
@@ -204,12 +204,12 @@ def test_a_stall_that_lasts_is_ended_by_opening_it_afresh(
 
 
 def test_a_fault_of_our_own_reaches_the_reader(virtual_sensor: VirtualSensor, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: _Count, message: Message) -> tuple[int, int]:
+    def fail(self: Count, message: Message) -> tuple[int, int]:
         raise ZeroDivisionError("on purpose")
 
     with OpenNIDevice() as device:
         device.read()
-        monkeypatch.setattr(_Count, "follow", fail)
+        monkeypatch.setattr(Count, "follow", fail)
         with pytest.raises(ZeroDivisionError, match="on purpose"):
             for _ in range(3):  # what came before may still be read
                 device.read(timeout_s=1)
@@ -219,7 +219,7 @@ def test_a_fault_of_our_own_reaches_the_reader(virtual_sensor: VirtualSensor, mo
 def test_numbers_and_times_go_on_rising(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now_s=100.0, monotonic=lambda: clock.now_s)
     monkeypatch.setattr("selective_depth.drivers.openni.device.time", clock)
-    count = _Count()
+    count = Count()
 
     def follow(index: int, timestamp_us: int) -> tuple[int, int]:
         return count.follow({"index": index, "timestamp_us": timestamp_us})

@@ -1,0 +1,83 @@
+"""The colour stream of an .oni file: what its frames are, and the one that belongs to a moment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import BinaryIO, Final
+
+from selective_depth.drivers.colour import Colouring, nearest, rgb_of
+from selective_depth.drivers.frame import Camera, ColourArray, DepthFrame
+from selective_depth.drivers.oni.files import read_payload
+from selective_depth.drivers.oni.records import NodeType
+from selective_depth.drivers.oni.report import CAMERA, REGISTERED, OniFrame, OniNode
+
+_KINDS: Final = {200: "RGB888", 201: "YUV422", 202: "GRAY8", 205: "YUYV"}
+"""OpenNI2's numbers of the pixel formats that colour comes in uncompressed."""
+
+
+class OniColour:
+    """Reads the colour frames of a recording.
+
+    Parameters
+    ----------
+    nodes : iterable of OniNode
+        The recording's streams; the first colour stream that has frames is taken.
+
+    Attributes
+    ----------
+    node : OniNode or None
+        The stream; None if there is none whose form is known.
+    camera : Camera or None
+        Its intrinsics, where they are recorded.
+    registered : bool
+        Whether the recording says that colour lies on depth.
+    unsupported : str
+        Why there is a colour stream that is not read; empty if there is none.
+    """
+
+    def __init__(self, nodes: Iterable[OniNode]) -> None:
+        self.node: OniNode | None = None
+        self.camera: Camera | None = None
+        self.registered = False
+        self.unsupported = ""
+        self._kind, self._size = "", (0, 0)
+        for node in nodes:
+            if node.node_type == NodeType.DEPTH:
+                self.registered = self.registered or node.number_of(REGISTERED) == 1
+            if node.node_type != NodeType.IMAGE or not node.frames or self.node is not None:
+                continue
+            mode = node.values_of("xnMapOutputMode", "<III") or (0, 0, 0)
+            kind = "JPEG" if node.codec == b"JPEG" else _KINDS.get(node.number_of("oniPixelFormat") or 200, "")
+            if node.codec not in (b"JPEG", b"NONE") or not kind or 0 in mode[:2]:
+                codec = node.codec.decode("ascii", "replace")
+                self.unsupported = f"the colour of {node.name} ({codec}) is of a form that is not read"
+                continue
+            self.node, self._kind, self._size = node, kind, (int(mode[0]), int(mode[1]))
+            self.camera = _camera(node, self._size)
+        self._times_us = [frame.timestamp_us for frame in self.node.frames] if self.node else []
+
+    def read(self, file: BinaryIO, frame: OniFrame) -> ColourArray | None:
+        """The image of a frame of the stream, the right way round; None if it is damaged."""
+        colour = rgb_of(read_payload(file, frame), self._kind, *self._size)
+        if colour is not None and frame.mirrored:
+            colour = colour[:, ::-1]
+        return colour
+
+    def on(self, file: BinaryIO, frame: DepthFrame, colouring: Colouring) -> DepthFrame:
+        """A depth frame with the colour nearest to it in time, where there is one near enough."""
+        at = nearest(self._times_us, frame.timestamp_us) if colouring.wanted and self.node else None
+        if at is None or self.node is None:
+            return frame
+        colour = self.read(file, self.node.frames[at])
+        if colour is None:
+            return frame
+        camera = self.camera and (self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy)
+        return colouring.told_by(camera or None, None).colour(frame, colour, self._times_us[at], self.registered)
+
+
+def _camera(node: OniNode, size: tuple[int, int]) -> Camera | None:
+    own, fov_rad = node.values_of(CAMERA, "<dddd"), node.values_of("xnFOV", "<dd")
+    try:
+        return Camera(*size, *own) if own else Camera.from_fov(*size, *fov_rad) if fov_rad else None
+    except ValueError:
+        return None
