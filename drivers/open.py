@@ -57,9 +57,9 @@ def open_source(uri: str | Path) -> DepthSource:
         from selective_depth.drivers.bag import BagReader
 
         scale, intrinsics = options.scale(), options.camera()
-        topic = options.text("topic", "a topic's name")
+        topic, colouring = options.text("topic", "a topic's name"), Colouring.of(options)
         options.done()
-        return BagReader(path, topic=topic, values_per_metre=scale, intrinsics=intrinsics)
+        return BagReader(path, topic=topic, values_per_metre=scale, intrinsics=intrinsics, colouring=colouring)
     if path.is_dir() or (suffix in (".npy", ".npz") and path.exists()):
         from selective_depth.drivers.folder import RecordedFolder
 

@@ -25,7 +25,7 @@ class Parent:
 
 def main(library: str, out: str, frames: int, width: int, height: int) -> None:
     worker.initialize({"library": library})
-    settings = {"width": width, "height": height, "fps": 30, "registration": False, "nearest": False}
+    settings = {"width": width, "height": height, "fps": 30, "registration": False, "nearest": False, "colour": False}
     live = worker.LiveStream({"uri": "", "like": None, "settings": settings}, Parent())
     recorder = openni2.Recorder(out.encode())
     recorder.attach(live.stream, False)
@@ -38,10 +38,10 @@ def main(library: str, out: str, frames: int, width: int, height: int) -> None:
     live.start()
     seen = 0
     while seen < frames:
-        frame = worker.next_frame(live.stream)
+        frame = worker.next_frame(live.streams)
         if frame is not None:
             seen += 1
-            frame.close()
+            frame[0].close()
     live.stream.stop()
     recorder.stop()
     recorder.close()

@@ -17,16 +17,17 @@ from selective_depth.app.pictures import palette
 from selective_depth.app.pipeline import FrameResult, say
 from selective_depth.app.pipeline.selecting import selector_of
 from selective_depth.app.settings import Settings
-from selective_depth.drivers.frame import Camera
+from selective_depth.drivers.frame import Camera, ColourArray, DepthFrame
 from selective_depth.selectors.acquire import Acquisition, acquire
 from selective_depth.selectors.seeds import SeedGrid
 
 
-def save_cloud(path: Path, acquisition: Acquisition, camera: Camera) -> int:
+def save_cloud(path: Path, acquisition: Acquisition, camera: Camera, colours: ColourArray | None = None) -> int:
     """Write the samples that returned depth as a point cloud (binary PLY).
 
     Points are in millimetres, x right, y down, z forward; each has the `round` it was measured
-    in (0 = seed) and its colour in the pictures of this program.
+    in (0 = seed), and the colour that the colour camera saw there or, without, that of its round
+    in the pictures of this program.
 
     Parameters
     ----------
@@ -36,6 +37,8 @@ def save_cloud(path: Path, acquisition: Acquisition, camera: Camera) -> int:
         The model.
     camera : Camera
         Intrinsics of its frame.
+    colours : uint8 array of shape (n, 3), optional
+        Colour of each sample, as `DepthFrame.colours_at` tells it.
 
     Returns
     -------
@@ -53,7 +56,7 @@ def save_cloud(path: Path, acquisition: Acquisition, camera: Camera) -> int:
     vertex["xyz"] = camera.points_mm(acquisition.uv[kept], acquisition.depth_mm[kept])
     vertex["round"] = rounds
     last = int(acquisition.round.max(initial=1))
-    vertex["rgb"] = palette.channels(palette.round_colours(last))[rounds]
+    vertex["rgb"] = palette.channels(palette.round_colours(last))[rounds] if colours is None else colours[kept]
     header = "\n".join(
         (
             "ply",
@@ -105,7 +108,7 @@ def save_samples(path: Path, acquisition: Acquisition) -> None:
 
 
 def save_model(
-    folder: Path, acquisition: Acquisition, camera: Camera, depth_mm: npt.NDArray[np.floating] | None = None
+    folder: Path, acquisition: Acquisition, frame: DepthFrame, depth_mm: npt.NDArray[np.floating] | None = None
 ) -> list[Path]:
     """Write ``cloud.ply``, ``depth.png`` and ``samples.npz`` into a folder, made if missing.
 
@@ -118,7 +121,7 @@ def save_model(
     """
     make_folder(folder)
     cloud, depth, samples = (folder / n for n in ("cloud.ply", "depth.png", "samples.npz"))
-    save_cloud(cloud, acquisition, camera)
+    save_cloud(cloud, acquisition, frame.camera, frame.colours_at(acquisition.uv))
     save_depth(depth, acquisition.reconstruct() if depth_mm is None else depth_mm)
     save_samples(samples, acquisition)
     return [cloud, depth, samples]
@@ -141,7 +144,7 @@ def save_result(folder: Path, result: FrameResult) -> list[Path]:
         rounds = np.zeros(len(uv), np.uint8)
         acquisition = replace(acquisition, uv=uv, depth_mm=known_mm[rows, columns], round=rounds)
     depth_mm = acquisition.reconstruct() if result.model is None else result.model.depth_mm
-    return save_model(folder, acquisition, result.frame.camera, depth_mm)
+    return save_model(folder, acquisition, result.frame, depth_mm)
 
 
 def model_frame(source: str, out: Path, number: int, settings: Settings) -> int:
@@ -159,6 +162,6 @@ def model_frame(source: str, out: Path, number: int, settings: Settings) -> int:
     seeds = SeedGrid.from_frame(frame, (settings.seeds.rows, settings.seeds.columns))
     how = settings.acquire
     acquisition = acquire(frame.measure, seeds, float(how.budget), how.rounds, selector)
-    for path in save_model(out, acquisition, frame.camera):
+    for path in save_model(out, acquisition, frame):
         say(f"wrote {path}")
     return OK

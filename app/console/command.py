@@ -36,7 +36,7 @@ from selective_depth.app.console.settings_file import preset_arguments, settings
 
 PROGRAM = "selective-depth"
 SHELLS = ("bash", "zsh")
-SOURCE_OPTIONS = ("scale", "camera", "mode", "topic", "stream")
+SOURCE_OPTIONS = ("scale", "camera", "mode", "topic", "stream", "colour")
 """Options of sources, which every command that opens one takes as ``--NAME VALUE``."""
 _SOURCE_HELP = (
     "With any command that takes a SOURCE or DEVICE, for what it does not say of itself:",
@@ -45,6 +45,8 @@ _SOURCE_HELP = (
     "  --mode 640x480@30    of a sensor",
     "  --topic NAME         of a ROS bag",
     "  --stream N           which depth stream of an .oni file, from 1",
+    "  --colour WORD        off; registered or unregistered, as it lies on depth; or the colour",
+    "                       camera as FX,FY,CX,CY,X,Y,Z, its place in mm beside that of depth",
 )
 SOURCES = ("source", "sources", "device")
 """Parameters of commands that name what `open_source` opens."""

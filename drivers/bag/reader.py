@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -12,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.bag.library import readable, rosbags
+from selective_depth.drivers.colour import CONVERSIONS, ON, Colouring, nearest, rgb_of, rgb_of_file
 from selective_depth.drivers.errors import SourceEndedError, SourceError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthFrame, millimetres
 from selective_depth.drivers.source import DepthSource
@@ -19,11 +22,18 @@ from selective_depth.drivers.source import DepthSource
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _CAMERA = "sensor_msgs/msg/CameraInfo"
 _RAW = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
+_COLOURS = {
+    "rgb8": "RGB888", "bgr8": "BGR8", "rgba8": "RGBA8", "bgra8": "BGRA8", "mono8": "GRAY8", "yuv422": "YUV422",
+    "yuv422_yuy2": "YUYV", "8UC3": "BGR8", "bayer_rggb8": "BAYER_RGGB8", "bayer_grbg8": "BAYER_GRBG8",
+    "bayer_bggr8": "BAYER_BGGR8", "bayer_gbrg8": "BAYER_GBRG8",
+}  # fmt: skip
+"""ROS's names of colour encodings, as `colour` calls them."""
+_INFRARED = ("infra", "/ir", "depth", "confidence", "left", "right", "fisheye")
 _PNG = b"\x89PNG"
 
 
 class BagReader(DepthSource):
-    """Depth frames of a bag, each exactly once, in the order of the bag.
+    """Depth frames of a bag, each exactly once, in the order of the bag, with the colour beside them.
 
     Whole numbers are millimetres and floating point is metres, as ROS has it (REP 118), unless the
     bag says its unit, as RealSense's recorder does.
@@ -39,6 +49,8 @@ class BagReader(DepthSource):
     intrinsics : (float, float, float, float), optional
         fx, fy, cx, cy in pixels; default those of the CameraInfo nearest in name, and in time to
         the first frame.
+    colouring : Colouring, optional
+        What is known of its colour; registered, by default, where the depth topic says so.
 
     Raises
     ------
@@ -59,6 +71,7 @@ class BagReader(DepthSource):
         topic: str = "",
         values_per_metre: float | None = None,
         intrinsics: tuple[float, ...] | None = None,
+        colouring: Colouring = ON,
     ) -> None:
         self.uri = str(path)
         self.path = Path(path)
@@ -82,6 +95,7 @@ class BagReader(DepthSource):
                 self._scale = values_per_metre or (1.0 if metres else unit or 1000.0)
                 self.camera, camera_from = self._camera(raw.shape, intrinsics, time_ns)
                 duration_s = self._bag.duration / 1e9
+                self._open_colour(colouring, time_ns)
         except BaseException:
             self.close()
             raise
@@ -90,9 +104,10 @@ class BagReader(DepthSource):
         where = "as given" if values_per_metre else "as the bag says" if unit else "as ROS has it"
         what = "metres" if metres and self._scale == 1 else f"{self._scale:g} values a metre"
         camera = self.camera
+        colour = f"; colour from {self._colour_topic}" if self._colour_topic else ""
         self.about = (
             f"'{self.uri}' is read as a ROS bag, topic {topic}: {what} ({where}); camera fx"
-            f" {camera.fx:g} fy {camera.fy:g} cx {camera.cx:g} cy {camera.cy:g} ({camera_from})."
+            f" {camera.fx:g} fy {camera.fy:g} cx {camera.cx:g} cy {camera.cy:g} ({camera_from}){colour}."
         )
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
@@ -107,9 +122,52 @@ class BagReader(DepthSource):
                 raise SourceEndedError(f"'{self.uri}' has ended after {self._next} frames.")
             time_ns, message = following
             depth_mm = millimetres(self._raw(message), self._scale)
-            frame = DepthFrame(depth_mm, self._next, time_ns // 1000, self.camera, self.uri)
+            frame = self._coloured(DepthFrame(depth_mm, self._next, time_ns // 1000, self.camera, self.uri))
         self._next += 1
         return frame
+
+    def _open_colour(self, colouring: Colouring, time_ns: int) -> None:
+        """Find the colour beside the depth: the image topic whose name has most in common with its."""
+        found = [n for n, t in self._bag.topics.items() if t.msgtype in (_IMAGE, _COMPRESSED) and n != self._topic]
+        found = [n for n in found if not any(part in n.lower() for part in _INFRARED) and self._is_colour(n)]
+        found.sort(key=lambda name: (-_shared(name, self._topic), name))
+        self._colour_topic = found[0] if found and colouring.wanted else ""
+        self._registered = any(word in self._topic for word in ("aligned_depth_to_color", "registered"))
+        self._colours = self._of(self._colour_topic) if self._colour_topic else iter(())
+        self._around: deque[tuple[int, Any]] = deque(maxlen=2)
+        infos = [name for name, t in self._bag.topics.items() if t.msgtype == _CAMERA]
+        name = max(infos, key=lambda name: _shared(name, self._colour_topic), default="")
+        if self._colour_topic and _shared(name, self._colour_topic) > max(1, _shared(self._colour_topic, self._topic)):
+            info = min(self._of(name), key=lambda item: abs(item[0] - time_ns))[1]
+            k = [float(each) for each in (info.K if hasattr(info, "K") else info.k)]
+            colouring = colouring.told_by((k[0], k[4], k[2], k[5]) if k[0] > 0 else None, None)
+        self._colouring = colouring
+
+    def _is_colour(self, topic: str) -> bool:
+        _, message = next(self._of(topic), (0, None))
+        kind = str(getattr(message, "encoding", None) or getattr(message, "format", ""))
+        return kind in _COLOURS or "jp" in kind
+
+    def _coloured(self, frame: DepthFrame) -> DepthFrame:
+        """A frame with the colour nearest to it in time."""
+        while not self._around or self._around[-1][0] < frame.timestamp_us * 1000:
+            following = next(self._colours, None)
+            if following is None:
+                break
+            self._around.append(following)
+        times_us = [time_ns // 1000 for time_ns, _ in self._around]
+        at = nearest(times_us, frame.timestamp_us)
+        if at is None:
+            return frame
+        message = self._around[at][1]
+        if hasattr(message, "format"):
+            colour = rgb_of_file(io.BytesIO(bytes(message.data)))
+        else:
+            rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
+            kind = _COLOURS[message.encoding]
+            tight = rows[:, : message.width * CONVERSIONS[kind][1]].tobytes()
+            colour = rgb_of(tight, kind, message.width, message.height)
+        return frame if colour is None else self._colouring.colour(frame, colour, times_us[at], self._registered)
 
     def close(self) -> None:
         """Close the bag. Harmless when called twice."""

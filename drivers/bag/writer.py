@@ -13,12 +13,15 @@ from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.frame import Camera, DepthFrame
 
 TOPIC = "/camera/depth/image_rect_raw"
-_CAMERA_TOPIC = "/camera/depth/camera_info"
+ALIGNED = "/camera/aligned_depth_to_color/image_raw"
 _FRAME = "camera_depth_optical_frame"
+_COLOUR_TOPIC = "/camera/color/image_raw"
 
 
 class BagWriter:
-    """Writes depth frames as ``sensor_msgs/Image``, 16UC1 in millimetres, with their CameraInfo.
+    """Writes frames as ``sensor_msgs/Image`` with their CameraInfo: depth as 16UC1 in millimetres, colour as rgb8.
+
+    Where colour lies on depth, the topic's name says so, as RealSense's does.
 
     Parameters
     ----------
@@ -49,10 +52,7 @@ class BagWriter:
             self._writer.open()
         except (OSError, library.WriterError) as error:
             raise self._failed(error) from error
-        kinds = {TOPIC: "sensor_msgs/msg/Image", _CAMERA_TOPIC: "sensor_msgs/msg/CameraInfo"}
-        self._topics = {
-            topic: self._writer.add_connection(topic, kind, typestore=self._store) for topic, kind in kinds.items()
-        }
+        self._topics: dict[str, Any] = {}
         self._count = 0
 
     def write(self, frame: DepthFrame) -> None:
@@ -67,18 +67,31 @@ class BagWriter:
         """
         if frame.timestamp_us < 0:
             raise ValueError(f"frame {frame.index} has the time {frame.timestamp_us} us; ROS has none before 0")
+        if self._count == 0:
+            self._depth_topic = ALIGNED if frame.colour is not None and frame.registered else TOPIC
+        data = frame.depth_mm.astype("<u2").reshape(-1).view(np.uint8)
+        self._put_image(self._depth_topic, frame.timestamp_us, frame.shape, "16UC1", data, frame.camera)
+        if frame.colour is not None and (frame.colour_us or 0) >= 0:
+            shape = frame.colour.shape[:2]
+            self._put_image(
+                _COLOUR_TOPIC, frame.colour_us or 0, shape, "rgb8", frame.colour.reshape(-1), frame.colour_camera
+            )
+        self._count += 1
+
+    def _put_image(
+        self, topic: str, time_us: int, shape: tuple[int, ...], encoding: str, data: Any, camera: Camera | None
+    ) -> None:
         types = self._store.types
-        seconds, rest_us = divmod(frame.timestamp_us, 1_000_000)
+        seconds, rest_us = divmod(time_us, 1_000_000)
         stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest_us * 1000)
         header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=_FRAME)
-        height, width = frame.shape
-        data = frame.depth_mm.astype("<u2").reshape(-1).view(np.uint8)
+        height, width = shape
         image = types["sensor_msgs/msg/Image"](
-            header, height, width, encoding="16UC1", is_bigendian=0, step=2 * width, data=data
+            header, height, width, encoding=encoding, is_bigendian=0, step=data.size // height, data=data
         )
-        self._put(_CAMERA_TOPIC, frame.timestamp_us, self._info(header, frame.camera))
-        self._put(TOPIC, frame.timestamp_us, image)
-        self._count += 1
+        if camera is not None:
+            self._put(f"{topic.rpartition('/')[0]}/camera_info", time_us, self._info(header, camera), "CameraInfo")
+        self._put(topic, time_us, image, "Image")
 
     def close(self) -> None:
         """Finish the bag and give it its name; without a frame there is none."""
@@ -103,7 +116,9 @@ class BagWriter:
             self._count = 0  # a source that failed leaves what it gave; a writer, nothing
         self.close()
 
-    def _put(self, topic: str, timestamp_us: int, message: Any) -> None:
+    def _put(self, topic: str, timestamp_us: int, message: Any, kind: str) -> None:
+        if topic not in self._topics:
+            self._topics[topic] = self._writer.add_connection(topic, f"sensor_msgs/msg/{kind}", typestore=self._store)
         connection = self._topics[topic]
         data = self._store.serialize_cdr(message, connection.msgtype)
         try:

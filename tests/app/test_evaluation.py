@@ -383,7 +383,7 @@ def test_a_budget_is_said_as_it_was_asked_for(budget: str, said: str, capsys: py
 def test_the_model_as_files(tmp_path: Path) -> None:
     seen = frame()
     acquisition = acquire(seen.measure, SeedGrid.from_frame(seen, SHAPE), 0.05, 3)
-    cloud, depth, samples = save_model(tmp_path / "new" / "model", acquisition, seen.camera)
+    cloud, depth, samples = save_model(tmp_path / "new" / "model", acquisition, seen)
     kept = acquisition.returned
     points = seen.camera.points_mm(acquisition.uv[kept], acquisition.depth_mm[kept])
     np.testing.assert_allclose(read_ply(cloud).points, points, rtol=1e-6)
@@ -405,12 +405,12 @@ def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
     seen = frame()
     acquisition = acquire(seen.measure, SeedGrid.from_frame(seen, SHAPE), 10, 1)
     with pytest.raises(OutputError, match=r"cloud\.ply' cannot be written: No such file"):
-        save_cloud(tmp_path / "missing" / "cloud.ply", acquisition, seen.camera)
+        save_cloud(tmp_path / "missing" / "cloud.ply", acquisition, seen)
     with pytest.raises(OutputError, match="cannot be written"):
         save_depth(tmp_path / "missing" / "depth.png", np.zeros((2, 2)))
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="model' cannot be written: Not a directory"):
-        save_model(tmp_path / "file" / "model", acquisition, seen.camera)
+        save_model(tmp_path / "file" / "model", acquisition, seen)
 
 
 def test_the_model_command(folder: Path, tmp_path: Path) -> None:

@@ -218,7 +218,7 @@ def test_a_fault_of_our_own_reaches_the_reader(virtual_sensor: VirtualSensor, mo
 
 def test_numbers_and_times_go_on_rising(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now_s=100.0, monotonic=lambda: clock.now_s)
-    monkeypatch.setattr("selective_depth.drivers.openni.device.time", clock)
+    monkeypatch.setattr("selective_depth.drivers.openni.clock.time", clock)
     count = Count()
 
     def follow(index: int, timestamp_us: int) -> tuple[int, int]:
