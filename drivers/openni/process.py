@@ -28,8 +28,8 @@ from selective_depth.drivers.openni.usb import usb_advice
 Message = dict[str, Any]
 """What the worker says; its ``kind`` tells what else is in it."""
 
-_SLOTS = 24  # 0.4 s of depth and colour, for one that records on a busy machine
-_SLOT_BYTES = 1920 * 1080 * 3  # more than any sensor of this kind has; unused pages cost none
+_SLOTS = 20  # a third of a second of depth and colour, for one that records on a busy machine
+_SLOT_BYTES = 1920 * 1080 * 2  # more than any sensor of this kind has; unused pages cost none
 _ERRORS = {kind.__name__: kind for kind in SourceError.__subclasses__()}
 
 

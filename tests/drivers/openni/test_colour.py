@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -25,6 +26,7 @@ pytestmark = pytest.mark.openni
 PLAYER = Path(__file__).parents[2] / "raw_colour_player.py"
 
 
+@cache
 def images(count: int = 20, height: int = 480, width: int = 640) -> npt.NDArray[np.uint8]:
     """Colour images that tell their number: frame k (from 0) has k + 1 in the red of its corner."""
     rows, columns = np.mgrid[0:height, 0:width]

@@ -141,14 +141,14 @@ def test_a_file_that_cannot_grow_is_noticed(virtual_sensor: VirtualSensor, tmp_p
     script = (
         "import resource, sys\n"
         "from selective_depth.drivers.openni import record\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (36_000_000, 36_000_000))\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (90_000_000, 90_000_000))\n"
         "report = record(sys.argv[1])\n"
         "print(report.ended, report.frames, report.problem, sep='|')\n"
     )
     out = tmp_path / "out.oni"
     noise = np.random.default_rng(0).integers(0, 9999, (4, 480, 640)).astype(np.uint16)
     noise.tofile(tmp_path / "noise.raw")
-    virtual_sensor.set(frames=tmp_path / "noise.raw")
+    virtual_sensor.set(frames=tmp_path / "noise.raw", fps=60)
     answer = subprocess.run([sys.executable, "-c", script, str(out)], capture_output=True, text=True, timeout=30).stdout
     ended, frames, problem = answer.strip().split("|")
     assert "cannot be written (File too large)" in ended

@@ -31,6 +31,9 @@ OPENED: Message = {
     "fps": 30,
     "fov_x_rad": 1.0,
     "fov_y_rad": 0.8,
+    "colour": None,
+    "colour_trouble": "",
+    "registered": False,
 }
 OPENS = (FOUND, OPENED)
 MISFIT: Message = {"kind": "misfit", "problem": "4x3 pixels"}
