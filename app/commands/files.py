@@ -48,9 +48,8 @@ def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
         return OK
     if report.swapped_frames:
         say(
-            f"note: OpenNI2's recorder swapped the last pixels of {report.swapped_frames} frames;"
-            " they are read rightly here, but its own player shows them wrong. --repair OUT.oni"
-            " writes a file without the flaw"
+            f"note: OpenNI2's recorder swapped the last pixels of {report.swapped_frames} frames; they are read rightly"
+            " here, but its own player shows them wrong. --repair OUT.oni writes a file without the flaw"
         )
     for note in report.notes:
         say(f"note: {note}")

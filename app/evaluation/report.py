@@ -148,9 +148,8 @@ def to_markdown(found: Sequence[Outcome]) -> str:
         ]
         for name, row in table.items():
             lines.append(
-                f"| {strategy_of(name).about} (`{name}`) | {row['geo']:.3f} | {row['worst']:.3f} |"
-                f" {row['share']:.1%} | {row['share_min']:.1%} | {row['rmse_mm']:.1f} |"
-                f" {row['mae_mm']:.2f} |"
+                f"| {strategy_of(name).about} (`{name}`) | {row['geo']:.3f} | {row['worst']:.3f} | {row['share']:.1%} |"
+                f" {row['share_min']:.1%} | {row['rmse_mm']:.1f} | {row['mae_mm']:.2f} |"
             )
         lines.append("")
     return "\n".join(lines)

@@ -272,9 +272,8 @@ def _shape_of(files: list[Path], stated: Camera | None) -> tuple[int, int]:
 
 def _size_error(path: Path, shape: tuple[int, ...], camera: Camera) -> DamagedRecordingError:
     return DamagedRecordingError(
-        f"'{path}' is {shape[1]}x{shape[0]} pixels, but this recording is {camera.width}x"
-        f"{camera.height}; keep frames of one size in a folder, and correct {SIDECAR} if it has"
-        " one."
+        f"'{path}' is {shape[1]}x{shape[0]} pixels, but this recording is {camera.width}x{camera.height}; keep frames"
+        f" of one size in a folder, and correct {SIDECAR} if it has one."
     )
 
 

@@ -86,9 +86,8 @@ class OniRecorder:
         report = inspect_oni(self.path)
         if not report.complete or report.readable_frames != self.frames:
             return (
-                f"'{self.path}' is not whole: it has {report.readable_frames} frames of"
-                f" {self.frames}. `selective-depth check '{self.path}' --repair OUT.oni` saves"
-                " those."
+                f"'{self.path}' is not whole: it has {report.readable_frames} frames of {self.frames}. `selective-depth"
+                f" check '{self.path}' --repair OUT.oni` saves those."
             )
         if self.missed:
             return f"{self.missed} frames are not in it: the disk was too slow."

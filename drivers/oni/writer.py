@@ -250,10 +250,9 @@ class OniWriter:
         since_us = frame.timestamp_us - self._first_us
         if since_us < 0:
             raise ValueError(
-                f"frame {frame.index} of '{frame.source}' is {-since_us} us older than the first:"
-                " its clock wrapped round or jumped back. Give rising timestamps_us in the folder's"
-                " frames.toml (2^32 more from there on, for a clock of 32 bits), or export to a"
-                " folder"
+                f"frame {frame.index} of '{frame.source}' is {-since_us} us older than the first: its clock wrapped"
+                " round or jumped back. Give rising timestamps_us in the folder's frames.toml (2^32 more from there"
+                " on, for a clock of 32 bits), or export to a folder"
             )
         if self._codec == CODEC_TABLE and np.unique(frame.depth_mm).size > MAX_DISTINCT:
             self._start_plain()
