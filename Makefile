@@ -7,7 +7,7 @@ WINDOW_PACKAGES := libvulkan1 mesa-vulkan-drivers
 TEST_PACKAGES := libopenni2-0 libopenni2-dev g++ $(WINDOW_PACKAGES) xvfb x11-utils
 
 .DEFAULT_GOAL := help
-.PHONY: help typing run test test-lowest test-slow lint format system-packages recordings pictures wheel wheel-check docs hooks clean
+.PHONY: help typing run test test-lowest test-slow fuzz lint format system-packages recordings pictures wheel wheel-check docs hooks clean
 
 help: ## Show this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -54,6 +54,9 @@ lint: $(VENV)/.tests-installed typing ## Check style, types and the import contr
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@PYTHONPATH=.typing $(BIN)/lint-imports --no-cache --no-logo
+
+fuzz: $(VENV)/.tests-installed ## Damage every kind of input for 20 minutes each, all side by side
+	@$(BIN)/python tests/fuzzing.py --minutes 20
 
 docs: $(VENV)/.installed typing ## Make the documentation and the API reference: out/docs/index.html
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'

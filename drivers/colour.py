@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import struct
+import warnings
+import zlib
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +23,13 @@ from selective_depth.drivers.options import Options
 PAIR_US: Final = 20_000
 """Images farther apart in time than this are not of one moment: at 30 frames/s the nearest is always nearer."""
 MOST_PIXELS: Final = 1 << 26
+BOMBS: Final = (Image.DecompressionBombError, Image.DecompressionBombWarning)
+"""What Pillow raises of images too large to be meant: the second is a warning until told otherwise."""
+DAMAGED: Final = (OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, EOFError,
+                  RuntimeError, struct.error, zlib.error)  # fmt: skip
+"""What Pillow, and NumPy's files, raise of what is damaged."""
+warnings.filterwarnings("ignore", module=r"PIL\.")  # it is said in our own words
+warnings.filterwarnings("error", category=Image.DecompressionBombWarning)
 CONVERSIONS: Final = {
     "RGB888": (None, 3), "YUV422": (cv2.COLOR_YUV2RGB_UYVY, 2), "YUYV": (cv2.COLOR_YUV2RGB_YUY2, 2),
     "GRAY8": (cv2.COLOR_GRAY2RGB, 1), "BGR8": (cv2.COLOR_BGR2RGB, 3), "RGBA8": (cv2.COLOR_RGBA2RGB, 4),
@@ -65,7 +75,7 @@ def rgb_of_file(file: Path | io.BytesIO) -> ColourArray | None:
             if image.width * image.height > MOST_PIXELS:
                 return None
             colour = np.array(image.convert("RGB"), np.uint8)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except (*DAMAGED, *BOMBS):
         return None
     colour.flags.writeable = False  # handed over: the frame need not copy it
     return colour

@@ -131,7 +131,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise UsageError(
             f"settings file '{path}' does not exist. A run with --save writes one to start from."
         ) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"settings file '{path}' cannot be read: {error}.") from None
 
 

@@ -93,7 +93,7 @@ def find_camera_file(root: Path) -> CameraFile | None:
             size = (int(numbers[0]), int(numbers[1]))
             return CameraFile(path, tuple(numbers[2:]), size)  # type: ignore[arg-type]
         return CameraFile(path, _matrix(numbers))
-    except (ValueError, LookupError, TypeError, AttributeError, ZeroDivisionError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise DamagedRecordingError(
             f"'{path}' holds no intrinsics in a form that is known ({error!s:.80}); put the"
             " camera and the scale into frames.toml, and rename or remove this file."

@@ -6,26 +6,29 @@ is not known here.
 
 from __future__ import annotations
 
-import re
+import io
+import math
+import tokenize
 import zipfile
-import zlib
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
+from selective_depth.drivers.colour import BOMBS, DAMAGED
 from selective_depth.drivers.errors import DamagedRecordingError
 from selective_depth.drivers.frame import DepthArray
 
 SUFFIXES: Final = (".png", ".pgm", ".tif", ".tiff", ".exr", ".npy", ".npz")
-SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
-HEADER_BYTES: Final = 33  # signature, and the IHDR chunk with its length, name and checksum
 MAX_SIDE: Final = 8192
 MAX_FILE_BYTES: Final = 256 * 1024 * 1024
+MAX_STACK_BYTES: Final = 16 << 30
 
-_COLOURS: Final = {0: "grey", 2: "colour", 3: "palette", 4: "grey + alpha", 6: "colour + alpha"}
+_MODES: Final = {"1": "a 1-bit grey", "L": "an 8-bit grey", "P": "a palette", "LA": "an 8-bit grey + alpha",
+                "RGB": "a colour", "RGBA": "a colour + alpha"}  # fmt: skip
 _NEXT: Final = "depth frames are 16-bit grey PNG; convert this file or remove it from the folder"
 
 
@@ -51,16 +54,19 @@ def read_raw(path: Path) -> npt.NDArray[Any]:
                 f"'{path}' holds {len(stack)} frames; one a file in a folder, or give it alone."
             )
         return np.array(stack[0])
-    data = _read_bytes(path, MAX_FILE_BYTES)
-    if suffix == ".pgm":
-        raw = _pgm(data)
-    elif suffix == ".exr":
+    if suffix == ".exr":
         raw = _exr(path)
     else:
-        raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    if raw is None or raw.ndim != 2 or raw.dtype not in (np.uint16, np.float32):
-        what = f"{raw.dtype} of shape {raw.shape}" if raw is not None else "damaged or cut off"
-        raise DamagedRecordingError(f"'{path}' is {what}; a depth image is grey, of 16 bits or floating point.")
+        try:
+            with Image.open(io.BytesIO(_read_bytes(path, MAX_FILE_BYTES)), formats=("TIFF", "PPM")) as image:
+                good = image.mode in ("I;16", "I;16B", "I", "F") and max(image.size) <= MAX_SIDE
+                raw = np.array(image, None if image.mode == "F" else np.uint16) if good else None
+        except (*DAMAGED, *BOMBS):
+            raw = None
+    if raw is None or raw.ndim != 2:
+        raise DamagedRecordingError(
+            f"'{path}' is damaged or cut off, or no depth image: those are grey, of 16 bits or floating point."
+        )
     return raw
 
 
@@ -89,8 +95,8 @@ def read_stack(path: Path) -> npt.NDArray[Any]:
                 names = [n for n in ("depth_mm", "depth") if n in loaded.files] or loaded.files
                 if len(names) > 1 and names[0] not in ("depth_mm", "depth"):
                     raise ValueError(f"it holds {', '.join(names)}; name the one array 'depth'")
-                loaded = loaded[names[0]]
-    except (OSError, ValueError, EOFError, IndexError, KeyError, zipfile.BadZipFile) as error:
+                loaded = _unpacked(path, names[0])
+    except (*DAMAGED, tokenize.TokenError, zipfile.BadZipFile) as error:
         raise DamagedRecordingError(
             f"'{path}' cannot be read as a NumPy array of depth ({error!s:.120}); write it again with numpy.save."
         ) from error
@@ -107,15 +113,19 @@ def read_stack(path: Path) -> npt.NDArray[Any]:
     return array
 
 
-def _pgm(data: bytes) -> npt.NDArray[Any] | None:
-    header = re.match(rb"P5\s+(?:#.*\s+)*(\d{1,5})\s+(\d{1,5})\s+(\d{1,5})\s", data)
-    if header is None or int(header[3]) < 256:
-        return None
-    width, height = int(header[1]), int(header[2])
-    if len(data) - header.end() < 2 * width * height or not 0 < max(width, height) <= MAX_SIDE:
-        return None
-    values = np.frombuffer(data, ">u2", width * height, header.end())
-    return values.reshape(height, width).astype(np.uint16)
+def _unpacked(path: Path, name: str) -> npt.NDArray[Any]:
+    """An array of an archive, after holding the size that its header states against what is there."""
+    with zipfile.ZipFile(path) as archive:
+        inner = next(each for each in archive.namelist() if each.removesuffix(".npy") == name)
+        with archive.open(inner) as file:
+            data = io.BytesIO(file.read(MAX_STACK_BYTES))
+    version = np.lib.format.read_magic(data)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, kind = header(data)
+    if math.prod(shape) * kind.itemsize > data.getbuffer().nbytes:
+        raise ValueError(f"it is cut off before the end of an array of shape {shape}")
+    data.seek(0)
+    return np.asarray(np.lib.format.read_array(data, allow_pickle=False))
 
 
 def _exr(path: Path) -> npt.NDArray[Any] | None:
@@ -141,14 +151,15 @@ def read_png_size(path: Path) -> tuple[int, int]:
     DamagedRecordingError
         If the file cannot be read or is no 16-bit grey PNG of a sensible size.
     """
-    return _size_from_header(path, _read_bytes(path, HEADER_BYTES))
+    with _opened(path) as file, _png(path, file) as image:
+        return image.height, image.width
 
 
 def read_png(path: Path) -> DepthArray:
     """Raw values of a 16-bit grey PNG.
 
-    The checksums are verified first: the decoder prints to stderr on damaged files, and some of
-    its versions deliver half of a truncated one as if it were whole.
+    Its checksums are verified first. Pillow does both: OpenCV prints to stderr on damaged files, and
+    some of its versions deliver half of a truncated one as if it were whole.
 
     Returns
     -------
@@ -159,13 +170,16 @@ def read_png(path: Path) -> DepthArray:
     DamagedRecordingError
         Naming the file, what was expected and what was found.
     """
-    data = _read_bytes(path, MAX_FILE_BYTES)
-    shape = _size_from_header(path, data[:HEADER_BYTES])
-    _check_chunks(path, data)
-    raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if raw is None or raw.dtype != np.uint16 or raw.shape != shape:
-        raise DamagedRecordingError(f"'{path}' cannot be decoded although its checksums are right; {_NEXT}.")
-    return np.asarray(raw, dtype=np.uint16)
+    data = io.BytesIO(_read_bytes(path, MAX_FILE_BYTES))
+    try:
+        with _png(path, data) as image:
+            image.verify()
+        with Image.open(data) as image:
+            return np.array(image, np.uint16)
+    except DAMAGED as error:
+        raise DamagedRecordingError(
+            f"'{path}' is damaged or cut off ({error}); copy it again, or remove it from the folder."
+        ) from error
 
 
 def write_png(path: Path, raw: npt.NDArray[Any], compression: int = 3) -> None:
@@ -188,56 +202,43 @@ def write_png(path: Path, raw: npt.NDArray[Any], compression: int = 3) -> None:
 
 
 def _read_bytes(path: Path, limit: int) -> bytes:
+    with _opened(path) as file:
+        return file.read(limit)
+
+
+def _opened(path: Path) -> BinaryIO:
     try:
         # Opening a pipe or a device in the folder would wait for ever.
         if not path.is_file():
             raise DamagedRecordingError(f"'{path}' is no regular file; {_NEXT}.")
-        with path.open("rb") as file:
-            return file.read(limit)
+        return path.open("rb")
     except OSError as error:
         raise DamagedRecordingError(
             f"'{path}' cannot be read ({error.strerror}); check that it is there and its permissions."
         ) from error
 
 
-def _size_from_header(path: Path, header: bytes) -> tuple[int, int]:
-    if header.startswith(b"version https://git-lfs"):
-        raise DamagedRecordingError(f"'{path}' is a Git LFS pointer and not the image; `git lfs pull` fetches it.")
-    if not header.startswith(SIGNATURE) or header[12:16] != b"IHDR":
-        what = "empty" if not header else "no PNG file, whatever its name says"
-        raise DamagedRecordingError(f"'{path}' is {what}; {_NEXT}.")
-    if len(header) < HEADER_BYTES:
-        raise DamagedRecordingError(f"'{path}' is cut off after {len(header)} bytes; copy it again.")
-    width, height = (int.from_bytes(header[at : at + 4], "big") for at in (16, 20))
-    bits, colour = header[24], header[25]
-    if (bits, colour) != (16, 0):
-        kind = _COLOURS.get(colour, f"colour type {colour}")
-        raise DamagedRecordingError(f"'{path}' is an {bits}-bit {kind} PNG; {_NEXT}.")
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+def _png(path: Path, file: BinaryIO) -> Image.Image:
+    """A PNG file's image, of which only the header was read, if it can be depth."""
+    try:
+        image = Image.open(file, formats=("PNG",))
+    except BOMBS as error:
         raise DamagedRecordingError(
-            f"'{path}' claims to be {width}x{height} pixels; allowed are 1 to {MAX_SIDE} each way."
+            f"'{path}' claims to be larger ({error}) than is allowed, 1 to {MAX_SIDE} pixels each way."
+        ) from None
+    except DAMAGED:
+        file.seek(0)
+        start = file.read(24)
+        what = (
+            "cut off" if start.startswith(b"\x89PNG") else "no PNG file, whatever its name says" if start else "empty"
         )
-    return height, width
-
-
-def _check_chunks(path: Path, data: bytes) -> None:
-    """Walk the chunks: lengths, checksums, and the end mark."""
-    view = memoryview(data)
-    at = len(SIGNATURE)
-    while at + 12 <= len(data):
-        length = int.from_bytes(view[at : at + 4], "big")
-        name, end = bytes(view[at + 4 : at + 8]), at + 12 + length
-        if end > len(data):
-            break
-        if zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
-            raise DamagedRecordingError(
-                f"'{path}' is damaged: the checksum of its part at byte {at} is wrong; copy it"
-                " again, or remove it from the folder."
-            )
-        if name == b"IEND":
-            return
-        at = end
-    raise DamagedRecordingError(
-        f"'{path}' is cut off: it ends after {len(data)} bytes without its end mark; copy it again,"
-        " or remove it from the folder."
-    )
+        if start.startswith(b"version https://git-lfs"):
+            what = "a Git LFS pointer and not the image; `git lfs pull` fetches it"
+        raise DamagedRecordingError(f"'{path}' is {what}; {_NEXT}.") from None
+    if image.mode != "I;16":
+        raise DamagedRecordingError(f"'{path}' is {_MODES.get(image.mode, f'a {image.mode}')} PNG; {_NEXT}.")
+    if max(image.size) > MAX_SIDE:
+        raise DamagedRecordingError(
+            f"'{path}' claims to be {image.width}x{image.height} pixels; allowed are 1 to {MAX_SIDE} each way."
+        )
+    return image

@@ -23,7 +23,7 @@ from selective_depth.drivers.colour import nearest
 from selective_depth.drivers.errors import DamagedRecordingError, SourceNotFoundError
 from selective_depth.drivers.folder.images import SUFFIXES
 from selective_depth.drivers.folder.sidecar import SIDECAR, read_text
-from selective_depth.drivers.frame import Camera
+from selective_depth.drivers.frame import MOST_TIME_US, Camera
 
 _Values = npt.NDArray[np.float64]
 _DECIMAL: Final = r"[0-9]{1,30}\.[0-9]{1,30}"
@@ -278,7 +278,8 @@ def stamps_of(row: Layout, files: list[Path]) -> tuple[int, ...] | None:
     pattern, unit_us = row.stamp or (_EPOCH, 1e6)
     matches = [re.search(pattern, path.stem) for path in files]
     times = [round(Decimal(match[1]) * round(unit_us)) for match in matches if match]
-    return tuple(times) if len(times) == len(files) else None
+    good = len(times) == len(files) and all(abs(time_us) <= MOST_TIME_US for time_us in times)
+    return tuple(times) if good else None
 
 
 def doubtful_order(files: list[Path]) -> tuple[str, ...]:
@@ -339,6 +340,8 @@ def _pairs(index: Path) -> list[tuple[int, list[tuple[int, str]]]]:
             continue
         try:
             pairs = [(round(float(words[at]) * 1e6), words[at + 1]) for at in range(0, len(words), 2)]
+            if any(abs(time_us) > MOST_TIME_US for time_us, _ in pairs):
+                raise ValueError
         except (ValueError, OverflowError, IndexError):
             raise DamagedRecordingError(
                 f"line {number} of '{index}' is {line!r:.80}; each line is a time in seconds and"
@@ -346,9 +349,10 @@ def _pairs(index: Path) -> list[tuple[int, list[tuple[int, str]]]]:
             ) from None
         for _, name in pairs:
             inside = PurePosixPath(name)
-            if inside.is_absolute() or ".." in inside.parts or "\\" in name or ":" in name:
+            outside = inside.is_absolute() or ".." in inside.parts or "\\" in name or ":" in name
+            if outside or "\0" in name or any(len(part) > 200 for part in inside.parts):
                 raise DamagedRecordingError(
-                    f"line {number} of '{index}' names '{name:.80}', which may lie outside of the"
+                    f"line {number} of '{index}' names '{name:.80}', which is no file's name or may lie outside of the"
                     " folder; name files inside it, as in depth/0001.png."
                 )
         lines.append((number, pairs))
