@@ -22,6 +22,8 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 }
 """What `--preset` sets, by name: "paper" is section V's."""
 
+SCHEMA = 1
+"""Version of a settings file; one without it is of before there were any."""
 LARGEST_BYTES = 1 << 20
 """No settings file is as large as this."""
 
@@ -36,7 +38,7 @@ def to_toml(settings: Settings, *heading: str) -> str:
     del tables["viewer"]["save"], tables["viewer"]["save_model"]
     flat = {key: value for name in FLAT_SECTIONS for key, value in tables.pop(name).items()}
     told = "".join(f"# {_one_line(line)}\n" for line in heading)
-    return told + tomli_w.dumps(_stated(flat | tables))
+    return told + tomli_w.dumps(_stated({"schema": SCHEMA} | flat | tables))
 
 
 def _one_line(text: str) -> str:
@@ -126,7 +128,13 @@ def _read(path: Path) -> dict[str, Any]:
             text = file.read(LARGEST_BYTES)
         if len(text) == LARGEST_BYTES:
             raise UsageError(f"settings file '{path}' is 1 MiB or more; settings take a few lines.")
-        return tomllib.loads(text.decode())
+        entries = tomllib.loads(text.decode())
+        schema = entries.pop("schema", SCHEMA)
+        if type(schema) is not int or schema > SCHEMA:
+            raise UsageError(
+                f"settings file '{path}' has schema {schema!r:.40}; up to {SCHEMA} is known, a later version wrote it."
+            )
+        return entries
     except FileNotFoundError:
         raise UsageError(
             f"settings file '{path}' does not exist. A run with --save writes one to start from."
