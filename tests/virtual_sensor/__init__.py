@@ -23,7 +23,8 @@ pad                0         bytes between the rows of a frame
 empty              0         1: transfers that carry nothing
 first_ms           50        how long its first frame takes
 unreadable         0         1: properties that it says it has cannot be read
-clock              0         its times: 1: always 0; 2: in ms; 3: 32 bits of 60 MHz, full after 1 s
+clock              0         its times: 1: always 0; 2: in ms; 3: 32 bits of 60 MHz, full after 1 s;
+                             4: every fourth lies before the one before
 aborts             0         1: the driver aborts when it is pulled out
 serial0, serial1             serial numbers of the sensors
 addresses          0         1: all are addresses of the first

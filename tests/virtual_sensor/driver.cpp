@@ -234,6 +234,7 @@ private:
         case 1: frame->timestamp = 0; break;
         case 2: frame->timestamp = time_us / 1000; break; // milliseconds
         case 3: frame->timestamp = ((time_us * 60 + 0xFFFFFFFFull - 60000000) & 0xFFFFFFFFull) / 60; break;
+        case 4: frame->timestamp = made_ % 4 ? time_us : time_us - 50000; break; // out of order
         default: frame->timestamp = time_us;
         }
         if (stride != width * 2) // rows apart, the last first: they overlap
