@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import struct
 import warnings
 import zlib
@@ -28,7 +29,9 @@ BOMBS: Final = (Image.DecompressionBombError, Image.DecompressionBombWarning)
 DAMAGED: Final = (OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, EOFError,
                   RuntimeError, struct.error, zlib.error)  # fmt: skip
 """What Pillow, and NumPy's files, raise of what is damaged."""
-warnings.filterwarnings("ignore", module=r"PIL\.")  # it is said in our own words
+# What it makes of damaged files is said in our own words.
+warnings.filterwarnings("ignore", module=r"PIL\.")
+logging.getLogger("PIL").setLevel(logging.CRITICAL)
 warnings.filterwarnings("error", category=Image.DecompressionBombWarning)
 CONVERSIONS: Final = {
     "RGB888": (None, 3), "YUV422": (cv2.COLOR_YUV2RGB_UYVY, 2), "YUYV": (cv2.COLOR_YUV2RGB_YUY2, 2),

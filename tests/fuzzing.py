@@ -2,7 +2,7 @@
 
 A target is a handful of small sound inputs and a way to read them. Inputs are damaged at random,
 blindly and with an eye to their form (numbers in headers and texts, checksums put right again). A
-finding is whatever is no named error: a crash, an exception of another kind, more than `HANG_S`
+finding is whatever is no named error: a crash, an exception of another kind, more than `HANG_S` of computing
 of time or `MEMORY_BYTES` of memory, or a word on standard error. Each target runs in a process of
 its own, and what it found is kept in ``out/fuzz``.
 """
@@ -334,9 +334,9 @@ def seeds_tried(name: str, first: int, until_s: float) -> Iterator[tuple[int, st
             assert try_one(target, files, Path(folder)) == "read", f"{list(files)} is not read undamaged"
     while time.monotonic() < until_s:
         with tempfile.TemporaryDirectory() as folder:
-            signal.setitimer(signal.ITIMER_REAL, HANG_S)
+            signal.setitimer(signal.ITIMER_PROF, HANG_S)
             yield seed, try_one(target, damaged(inputs, seed), Path(folder))
-            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.setitimer(signal.ITIMER_PROF, 0)
         seed += 1
 
 
@@ -345,9 +345,9 @@ def _work(name: str, first: int, minutes: float, note: Path) -> int:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
 
     def late(*_: object) -> None:
-        raise TimeoutError(f"an input takes longer than {HANG_S} s")
+        raise TimeoutError(f"an input computes for more than {HANG_S} s")
 
-    signal.signal(signal.SIGALRM, late)
+    signal.signal(signal.SIGPROF, late)
     counts: Counter[str] = Counter()
     seed = first
     with tempfile.TemporaryFile() as said:
