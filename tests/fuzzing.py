@@ -2,8 +2,8 @@
 
 A target is a handful of small sound inputs and a way to read them. Inputs are damaged at random,
 blindly and with an eye to their form (numbers in headers and texts, checksums put right again). A
-finding is whatever is no named error: a crash, an exception of another kind, more than `HANG_S` of computing
-of time or `MEMORY_BYTES` of memory, or a word on standard error. Each target runs in a process of
+finding is whatever is no named error: a crash, an exception of another kind, more than `HANG_S`
+of computing or `MEMORY_BYTES` of memory, or a word on standard error. Each target runs in a process of
 its own, and what it found is kept in ``out/fuzz``.
 """
 

@@ -146,6 +146,28 @@ def test_a_damaged_kernel_is_compiled_anew_and_that_is_said_once(
     assert run_twice() == (41, 0, [])
 
 
+def test_fifty_random_damages_heal(run_twice: Callable[[], tuple[int, int, list[str]]], tmp_path: Path) -> None:
+    draw = random.Random(2)
+    for number in range(50):
+        run_twice()
+        file = draw.choice(sorted(path for path in tmp_path.rglob("*.nb[ic]")))
+        data = bytearray(file.read_bytes())
+        at = draw.randrange(len(data))
+        way = draw.choice(("flip", "cut", "block", "longer"))
+        if way == "flip":
+            data[at] ^= 1 << draw.randrange(8)
+        elif way == "cut":
+            del data[at:]
+        elif way == "block":
+            data[at : at + 64] = draw.randbytes(64)
+        else:
+            data += draw.randbytes(64)
+        file.write_bytes(data)
+        result, compiled, said = run_twice()
+        assert (result, compiled, len(said)) == (41, 1, 1), (number, way, at)
+        assert run_twice() == (41, 0, []), (number, way, at)
+
+
 def test_another_source_is_no_damage(run_twice: Callable[[], tuple[int, int, list[str]]], tmp_path: Path) -> None:
     run_twice()
     (tmp_path / "module.py").write_text(KERNEL.format(extra=200))
