@@ -433,30 +433,86 @@ def test_a_damaged_pgm_is_named(tmp_path: Path, content: bytes) -> None:
 # The folders that went wrong
 
 
+def _rotated_mm(raw: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    bits = raw.astype(np.uint32)
+    return ((bits >> 3) | ((bits << 13) & 0xFFFF)).astype(np.float64)
+
+
+def _per_metre(values: float) -> Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]]:
+    return lambda raw: np.rint(raw * (1000 / values))
+
+
+THIRDS_US = (0, 33333, 66667)
+DECIMALS_US = (1305031102160000, 1305031102200000, 1305031102243000, 1305031102300000)
+
+
 @pytest.mark.parametrize(
-    ("folder", "layout", "fx", "first_us"),
+    ("folder", "layout", "camera", "times_us", "millimetres", "coloured"),
     [
-        ("icl/living_room_traj0_frei_png", "ICL-NUIM", 481.2, 0),
-        ("tum_assoc_only/rgbd_dataset_freiburg3_x", "TUM", 535.4, STAMPS_US[0]),
-        ("sun3d/hotel_umd", "SUN3D", 570.342205, 0),
-        ("bop/000001", "BOP", 1066.8, 0),
-        ("replica/room0", "Replica", 600.0, 0),
-        ("kitti_dc", "KITTI", 721.5377, 0),
-        ("openloris/cafe1-1", "OpenLORIS", 585.0, STAMPS_US[0]),
-        ("open3d_rs/dataset", "Open3D / RealSense", 424.6, 0),
-        ("open3d_l515/dataset", "Open3D / RealSense", 458.3, 0),
-        ("scannet/scene0000_00", "ScanNet", 577.590698, 0),
-        ("eth3d/plant_scene_1", "ETH3D", 726.28741455078, STAMPS_US[0]),
-        ("floatnames", "plain", 585.0, 1305031102160000),
-        ("rgbdscenes2/scene_01", "RGB-D Scenes v2", 570.3, 0),
+        ("icl/living_room_traj0_frei_png", "ICL-NUIM", (481.2, 480.0, 319.5, 239.5), None, _per_metre(5000), 12),
+        (
+            "tum_assoc_only/rgbd_dataset_freiburg3_x",
+            "TUM",
+            (535.4, 539.2, 320.1, 247.6),
+            STAMPS_US,
+            _per_metre(5000),
+            3,
+        ),
+        ("sun3d/hotel_umd", "SUN3D", (570.342205, 570.342205, 320, 240), (0, 33333, 66666), _rotated_mm, 3),
+        ("bop/000001", "BOP", (1066.8, 1067.5, 312.99, 241.3), THIRDS_US, _per_metre(10_000), 3),
+        ("replica/room0", "Replica", (600, 600, 599.5, 339.5), THIRDS_US, _per_metre(6553.5), 1),
+        ("kitti_dc", "KITTI", (721.5377, 721.5377, 609.5593, 172.854), THIRDS_US, _per_metre(256), 0),
+        ("openloris/cafe1-1", "OpenLORIS", (585, 585, 320, 240), STAMPS_US, _per_metre(1000), 3),
+        ("open3d_rs/dataset", "Open3D / RealSense", (424.6, 424.6, 423.1, 239.6), THIRDS_US, _per_metre(1000), 3),
+        ("open3d_l515/dataset", "Open3D / RealSense", (458.3, 458.3, 331.2, 251.6), THIRDS_US, _per_metre(1000), 3),
+        (
+            "scannet/scene0000_00",
+            "ScanNet",
+            (577.590698, 578.729797, 318.905426, 242.683609),
+            None,
+            _per_metre(1000),
+            4,
+        ),
+        (
+            "eth3d/plant_scene_1",
+            "ETH3D",
+            (726.28741455078, 726.28741455078, 354.6496887207, 186.46566772461),
+            STAMPS_US,
+            _per_metre(5000),
+            3,
+        ),
+        ("floatnames", "plain", (585, 585, 320, 240), DECIMALS_US, _per_metre(1000), 0),
+        ("rgbdscenes2/scene_01", "RGB-D Scenes v2", (570.3, 570.3, 320, 240), THIRDS_US[:2], _per_metre(1000), 2),
     ],
 )
-def test_a_case_is_right(shared_cases: Path, folder: str, layout: str, fx: float, first_us: int) -> None:
+def test_a_case_is_right_in_every_pixel(
+    shared_cases: Path,
+    folder: str,
+    layout: str,
+    camera: tuple[float, ...],
+    times_us: tuple[int, ...] | None,
+    millimetres: Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]],
+    coloured: int,
+) -> None:
+    """The raw values are decoded by OpenCV and converted by the publisher's formula, written out here."""
     with open_source(shared_cases / "folders" / folder) as source:
         assert isinstance(source, RecordedFolder)
-        assert (source.layout, source.camera.fx) == (layout, fx)
+        assert source.layout == layout
+        files = source.found.files
+        seen = source.camera
         frames = list(source)
-    assert frames[0].timestamp_us == first_us
+    assert (seen.fx, seen.fy, seen.cx, seen.cy) == pytest.approx(camera)
+    assert len(frames) == len(files)
+    if times_us is None:
+        times_us = tuple(round(k * 1e6 / 30) for k in range(len(frames)))
+    assert tuple(frame.timestamp_us for frame in frames) == tuple(times_us)
+    for frame, file in zip(frames, files, strict=True):
+        raw = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        assert raw is not None and raw.dtype == np.uint16
+        wanted = millimetres(raw.astype(np.float64))
+        wanted[wanted > 65535] = 0
+        np.testing.assert_array_equal(frame.depth_mm, wanted)
+    assert sum(frame.colour is not None for frame in frames) == coloured
     # All were made of the same three frames, some resized.
     for frame, median_mm in zip(frames, (1917, 1930, 1943), strict=False):
         assert abs(np.median(frame.depth_mm[frame.depth_mm > 0]) - median_mm) < 60
