@@ -19,6 +19,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from selective_depth.app.cli import run
+from selective_depth.drivers.bag import BagWriter
 from selective_depth.drivers.errors import DamagedRecordingError, SourceError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.open import open_source
@@ -245,3 +246,75 @@ def test_without_the_package_it_is_named(
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(SourceError, match=r"pip install 'selective-depth\[ros\]'"):
         open_source(path)
+
+
+# Colour beside depth
+
+
+def colour_of(frame: DepthFrame) -> npt.NDArray[np.uint8]:
+    rows, columns = np.mgrid[0:120, 0:160]
+    return np.stack((columns, rows, np.full_like(rows, 7 * frame.index)), axis=-1).astype(np.uint8)
+
+
+def colour_message(form: str, late_us: int) -> Callable[[Any, DepthFrame], Any]:
+    def make(store: Any, frame: DepthFrame) -> Any:
+        rgb, head = colour_of(frame), header(store, frame.timestamp_us + late_us)
+        if form == "jpeg":
+            data = np.frombuffer(cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100])[1], np.uint8)
+            return store.types["sensor_msgs/msg/CompressedImage"](head, format="rgb8; jpeg compressed bgr8", data=data)
+        pixels = {"rgb8": rgb, "bgr8": rgb[..., ::-1], "mono8": cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)}[form]
+        padded = np.pad(np.ascontiguousarray(pixels).reshape(120, -1), ((0, 0), (0, 5)))
+        return store.types["sensor_msgs/msg/Image"](
+            head, 120, 160, encoding=form, is_bigendian=0, step=padded.shape[1], data=padded.reshape(-1)
+        )
+
+    return make
+
+
+@pytest.mark.parametrize("kind", ["bag", "ros2", "mcap"])
+@pytest.mark.parametrize("form", ["rgb8", "bgr8", "mono8", "jpeg"])
+def test_colour_is_the_nearest_in_time(tmp_path: Path, frames: list[DepthFrame], kind: str, form: str) -> None:
+    topic = "/camera/color/image_raw" + ("/compressed" if form == "jpeg" else "")
+    topics = {topic: colour_message(form, 9_000), "/camera/infra1/image_raw": colour_message("mono8", 0), **forms("mm")}
+    if form == "jpeg":
+        topics["/camera/color/image_raw"] = lambda store, frame: image(store, frame, "odd")
+    with open_source(write(tmp_path, kind, topics, frames[:6])) as source:
+        assert f"colour from {topic}" in source.about
+        for before, after in zip(frames, source, strict=False):
+            assert after.colour is not None and after.colour_us == before.timestamp_us + 9_000 and not after.registered
+            wanted = colour_of(before)
+            if form == "mono8":
+                wanted = np.repeat(cv2.cvtColor(wanted, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
+            assert np.abs(after.colour.astype(int) - wanted).max() <= (20 if form == "jpeg" else 0)
+
+
+@pytest.mark.parametrize("registered", [True, False])
+@pytest.mark.parametrize("name", ["x.mcap", "x.ros2"])
+def test_written_colour_comes_back(tmp_path: Path, frames: list[DepthFrame], name: str, registered: bool) -> None:
+    other = Camera(160, 120, 150.0, 151.0, 80.5, 61.0)
+    given = [
+        DepthFrame(
+            frame.depth_mm,
+            frame.index,
+            frame.timestamp_us,
+            CAMERA,
+            colour=None if frame.index == 2 else colour_of(frame),
+            colour_us=frame.timestamp_us - 4_000,
+            colour_camera=None if registered else other,
+            registered=registered,
+        )
+        for frame in frames[:5]
+    ]
+    with BagWriter(tmp_path / name) as writer:
+        for frame in given:
+            writer.write(frame)
+    with open_source(tmp_path / name) as source:
+        for before, after in zip(given, source, strict=True):
+            np.testing.assert_array_equal(before.depth_mm, after.depth_mm)
+            assert (after.colour is None) == (before.colour is None)
+            if before.colour is not None and after.colour is not None:
+                np.testing.assert_array_equal(before.colour, after.colour)
+                assert after.colour_us == before.colour_us and after.registered == registered
+                assert after.colour_camera == (CAMERA if registered else other)
+    with open_source(f"{tmp_path / name}?colour=off") as source:
+        assert source.read().colour is None
