@@ -15,6 +15,7 @@ from selective_depth.app.console import dispatch
 from selective_depth.app.console.command import PROGRAM, command
 from selective_depth.app.settings import (
     AcquireOptions,
+    BatchOptions,
     Flag,
     GasOptions,
     ImprovementOptions,
@@ -42,7 +43,7 @@ SourceOrSample = Annotated[str | None, optional("SOURCE")]
 Options = Annotated[Settings, arg(name="")]
 Acquiring = Annotated[AcquireOptions, arg(name="")]
 Page = Annotated[PictureOptions, arg(name="")]
-DEFAULTS, PAGE, MODEL = Settings(), PictureOptions(), AcquireOptions(budget=0.05, rounds=8)
+DEFAULTS, PAGE, MODEL, BATCH = Settings(), PictureOptions(), AcquireOptions(budget=0.05, rounds=8), BatchOptions()
 SCENES = ("virtual:workstation", "virtual:ball", "virtual:firehose")
 
 
@@ -182,6 +183,44 @@ def export(source: Source, out: Annotated[Path, arg(metavar="OUT")], /, frames: 
     from selective_depth.app.commands.files import export as save
 
     return save(source, out, frames)
+
+
+@command(
+    "Files",
+    (f"{PROGRAM} batch archive/ --out results", "every recording in it: a table each, and a summary"),
+    (f"{PROGRAM} batch 'day1/*.oni' scans/ --out results --budget 5% --models", "and what a budget buys"),
+    (f"find . -name '*.oni' | {PROGRAM} batch - --out results", "a list of recordings"),
+    (f"{PROGRAM} batch archive/ --out results --scheduler tcp://host:8786", "on a Dask cluster"),
+)
+def batch(
+    sources: Annotated[tuple[str, ...], optional("SOURCE...")],
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    options: Annotated[BatchOptions, arg(name="")] = BATCH,
+    seeds: SeedOptions = DEFAULTS.seeds,
+    gas: GasOptions = DEFAULTS.gas,
+    improvement: ImprovementOptions = DEFAULTS.improvement,
+    acquire: Acquiring = DEFAULTS.acquire,
+) -> int:
+    """Run every recording of an archive through both selectors: a table each, and a summary.
+
+    Started again, it goes on where it was: what is done and unchanged is left as it is.
+
+    Parameters
+    ----------
+    sources : tuple of str
+        Recordings, folders that hold some, patterns, scenes; - reads a list from stdin.
+    out : Path
+        Folder for the tables, made if need be.
+    options
+        What is kept, and who does the work.
+    seeds, gas, improvement, acquire
+        Options of the selectors.
+    """
+    from selective_depth.app.commands.batch import run_batch
+
+    settings = Settings(seeds=seeds, gas=gas, improvement=improvement, acquire=acquire)
+    return run_batch(sources, out, options, settings)
 
 
 @command("Files", (f"{PROGRAM} model frames/ model --frame 30 --budget 0.05", "a cloud, its depth, its samples"))

@@ -215,6 +215,33 @@ class ComparisonOptions:
     """Processes; by default one per processor."""
 
 
+Keep = Annotated[tuple[Literal["masks", "maps", "depth"], ...], arg(metavar="masks|maps|depth...")]
+Scheduler = Annotated[str | None, optional("tcp://HOST:PORT|FILE")]
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """What is kept of each recording besides its table, and who does the work."""
+
+    models: Flag = False
+    """The model of its last frame: cloud.ply, depth.png and samples.npz."""
+    keep: Keep = ()
+    """Of every frame, as PNG: masks (1 neural gas + 2 improvement), maps (the improvement map,
+    65535 = the best), depth (the model in mm)."""
+    stills: Natural = 0
+    """So many pictures of frames, spread over it."""
+    rrd: Flag = False
+    """A Rerun recording."""
+    frames: Limit = None
+    """At most so many frames of each."""
+    scheduler: Scheduler = None
+    """A Dask scheduler: its address or its file; by default processes of this machine."""
+    workers: Limit = None
+    """How many of these; by default one per processor."""
+    force: Flag = False
+    """Do again what is done and unchanged."""
+
+
 @dataclass(frozen=True)
 class EvaluationFiles:
     """Where an evaluation is written, besides the terminal."""

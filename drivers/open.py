@@ -6,7 +6,7 @@ from pathlib import Path
 
 from selective_depth.drivers.colour import Colouring
 from selective_depth.drivers.errors import SourceNotFoundError
-from selective_depth.drivers.options import Options
+from selective_depth.drivers.options import Options, parted
 from selective_depth.drivers.source import DepthSource
 
 _WHAT_THERE_IS = "Give an .oni file, a folder of 16-bit PNG frames, 'openni' for a sensor, or 'virtual:workstation'."
@@ -46,7 +46,7 @@ def open_source(uri: str | Path) -> DepthSource:
         from selective_depth.drivers.virtual import VirtualSource
 
         return VirtualSource(rest)
-    named, _, query = (name, "", "") if Path(name).exists() else name.partition("?")
+    named, query = parted(name)
     path, options = Path(named), Options(query, f"'{named}'")
     suffix = path.suffix.lower()
     if suffix == ".ply":

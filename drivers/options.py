@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import MOST_PX
@@ -16,6 +17,12 @@ def appended(uri: str, given: dict[str, str]) -> str:
     """A source's name with options after it, as `open_source` takes it."""
     more = "&".join(f"{name}={value}" for name, value in given.items())
     return f"{uri}{'&' if '?' in uri else '?'}{more}" if more else uri
+
+
+def parted(uri: str) -> tuple[str, str]:
+    """A source's name without its options, and these; what exists under the whole name has none."""
+    name, _, options = (uri, "", "") if Path(uri).exists() else uri.partition("?")
+    return name, options
 
 
 class Options:

@@ -84,6 +84,14 @@ class DepthSource(ABC):
             As their names say; frames already delivered stay good.
         """
 
+    def skip(self, frames: int) -> None:
+        """Leave out the next frames of a recording; raises as `read` does.
+
+        Where a frame may depend on those before it, these are read for it.
+        """
+        for _ in range(frames):
+            self.read()
+
     @abstractmethod
     def close(self) -> None:
         """Release the source. Harmless when called twice."""

@@ -19,12 +19,14 @@ from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pictures import StillRow, contact_sheet, write_picture
+from selective_depth.app.pictures.palette import FIGURES
 from selective_depth.app.pipeline import (
     Feed,
     FrameResult,
     Pipeline,
     RunReport,
     SensorNote,
+    figures_of,
     is_settings,
     open_and_tell,
     print_report,
@@ -250,12 +252,8 @@ class Session:
             fps=(len(self._recent_s) - 1) / (now_s - self._recent_s[0]),
             dropped_sensor=source.dropped,
             dropped_viewer=sum(viewer.dropped.values()),
-            samples=result.samples,
-            quantisation_error_mm=result.regions.quantisation_error_mm,
+            **{name: value for name, value in figures_of(result).items() if name in FIGURES},
         )
-        if result.model is not None:
-            for name in ("rmse_mm", "truth_rmse_mm", "sensor_rmse_mm", "even_rmse_mm"):
-                result.figures[name] = getattr(result.model, name)
         if result.memory is not None:
             size = result.frame.depth_mm.size
             result.figures["measured"] = 100 * len(result.memory.uv) / size

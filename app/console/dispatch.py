@@ -58,7 +58,7 @@ def run(arguments: Sequence[str], examples: Sequence[Example]) -> int:
     except Exception as error:  # the one place where any error becomes one line
         if debug:
             raise
-        _say(_sentence(error))
+        _say(sentence_of(error))
         return MISUSED if isinstance(error, UsageError) else FAILED
 
 
@@ -116,7 +116,8 @@ def _versions() -> str:
     return f"{PROGRAM} {__version__}\n{runtime}"
 
 
-def _sentence(error: Exception) -> str:
+def sentence_of(error: Exception) -> str:
+    """An error in one sentence: its own where it is one of ours, else what kind it is."""
     from selective_depth.drivers.errors import SourceError
 
     words = " ".join(str(error).split())

@@ -85,6 +85,22 @@ def deferred() -> Iterator[None]:
     check()
 
 
+@contextmanager
+def started_deaf() -> Iterator[None]:
+    """Let processes that start meanwhile be deaf to Ctrl-C from their first moment.
+
+    It goes to all processes of a terminal; their parent says what becomes of it.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _unless_interrupted(lost: sys.UnraisableHookArgs) -> None:
     if not isinstance(lost.exc_value, KeyboardInterrupt):
         sys.__unraisablehook__(lost)

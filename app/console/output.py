@@ -137,7 +137,7 @@ def write_output(path: Path, data: bytes | str) -> None:
         file.write(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
 
-def write_image(path: Path, image: npt.NDArray[np.uint8]) -> None:
+def write_image(path: Path, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
     """Write a blue-green-red image as PNG or WebP, by the file's ending.
 
     Raises

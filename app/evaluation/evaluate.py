@@ -11,11 +11,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -134,19 +132,6 @@ def _begin_worker() -> None:
     # ends with its parent, however that ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-@contextmanager
-def _started_deaf_to_ctrl_c() -> Iterator[None]:
-    """Let processes that start meanwhile be deaf to Ctrl-C from their first moment."""
-    if sys.platform == "win32":
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _end_with_parent() -> None:
@@ -274,7 +259,7 @@ def _spread(
     try:
         for number, frame in chosen:
             # A worker whose start is cut short reports that nobody told it what to do.
-            with interrupt.deferred(), _started_deaf_to_ctrl_c():
+            with interrupt.deferred(), interrupt.started_deaf():
                 under_way[pool.submit(_evaluate_frame, frame, *arguments)] = number
             if len(under_way) == 2 * jobs:
                 settle()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -10,12 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet
 
 from selective_depth.app import __version__
+from selective_depth.app.console import tables
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.output import check_output, write_output
+from selective_depth.app.console.output import check_output
 from selective_depth.app.evaluation.evaluate import Outcome, summarise
 from selective_depth.app.evaluation.strategies import strategy_of
 
@@ -110,12 +108,7 @@ def write_table(path: Path, found: Sequence[Outcome]) -> None:
         for outcome in found
         for draw, errors in enumerate(outcome.errors)
     ]
-    table = pa.Table.from_pylist(rows)
-    table = table.replace_schema_metadata({"schema": str(SCHEMA), "version": __version__})
-    data = io.BytesIO()
-    write = pa.csv.write_csv if path.suffix.lower() == ".csv" else pa.parquet.write_table
-    write(table, data)
-    write_output(path, data.getvalue())
+    tables.write_table(path, pa.Table.from_pylist(rows), SCHEMA)
 
 
 def curves(found: Sequence[Outcome], width_in: float) -> Figure:

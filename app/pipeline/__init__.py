@@ -1,6 +1,7 @@
 """One frame's way: a frame in; seeds, both selectors, the samples and the model out."""
 
 from selective_depth.app.pipeline.feed import Feed, Read, open_and_tell, state_of
+from selective_depth.app.pipeline.figures import figures_of
 from selective_depth.app.pipeline.pipeline import Pipeline
 from selective_depth.app.pipeline.report import RunReport, is_settings, print_report, save_settings, say
 from selective_depth.app.pipeline.result import FrameResult, Model, SensorNote
@@ -17,6 +18,7 @@ __all__ = [
     "SensorNote",
     "StageSummary",
     "StageTimes",
+    "figures_of",
     "is_settings",
     "open_and_tell",
     "print_report",

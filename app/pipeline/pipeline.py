@@ -6,9 +6,9 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -44,6 +44,15 @@ def _as_options(section: str) -> Iterator[None]:
         raise UsageError(f"--{section}.{error}.") from None
 
 
+class _AtOnce(Executor):
+    """Does what it is given in the calling thread."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
 class Pipeline:
     """Both selectors and the acquisition, frame by frame, every stage timed.
 
@@ -60,6 +69,9 @@ class Pipeline:
     realtime : bool, default False
         Frames come whether the pipeline is ready or not. Then the dense model of every
         `MODEL_EVERY`-th is made beside it, and the other frames have none.
+    one_thread : bool, default False
+        Make every frame in the calling thread, one after the other: where each processor has a
+        process of its own.
 
     Raises
     ------
@@ -67,9 +79,9 @@ class Pipeline:
         If an option of a selector is out of its range.
     """
 
-    def __init__(self, settings: Settings, *, realtime: bool = False) -> None:
-        self._overlap = int(settings.acquire.budget > 0 or not realtime)
-        self._threads = settings.run.threads or (1 if self._overlap else None)
+    def __init__(self, settings: Settings, *, realtime: bool = False, one_thread: bool = False) -> None:
+        self._overlap = 0 if one_thread else int(settings.acquire.budget > 0 or not realtime)
+        self._threads = settings.run.threads or (1 if self._overlap or one_thread else None)
         self.times = StageTimes()
         self._settings = settings
         self._live_gas = settings.gas.training == "live"
@@ -85,7 +97,7 @@ class Pipeline:
         self._realtime = realtime
         # The stages are compiled and free of the GIL: side by side they take as long as the
         # longest of them.
-        self._beside = ThreadPoolExecutor(2, thread_name_prefix="beside")
+        self._beside: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(2, thread_name_prefix="beside")
         self._modelling = ThreadPoolExecutor(1, thread_name_prefix="model")
         # One thread: frames enter the memory in their order.
         self._remembering = ThreadPoolExecutor(1, thread_name_prefix="memory")
@@ -102,6 +114,12 @@ class Pipeline:
             self._pending.result()
         self._memory = None
         self.times.clear()
+
+    def train(self, frame: DepthFrame) -> None:
+        """Train the first nodes alone, as `warm_up` leaves them, where all is compiled already."""
+        if self._live_gas:
+            self._regions(self._seeds(frame), {})
+            self.times.clear()
 
     def make(self, frame: DepthFrame) -> FrameResult:
         """Make all of one frame that there is to make; nothing else may be under way."""

@@ -13,6 +13,7 @@ from rich.table import Table
 from selective_depth.app import __version__
 from selective_depth.app.console.output import write_output
 from selective_depth.app.console.settings_file import to_toml
+from selective_depth.app.pipeline.figures import figures_of
 from selective_depth.app.pipeline.result import FrameResult
 from selective_depth.app.pipeline.timing import StageSummary
 from selective_depth.app.settings import Settings
@@ -74,8 +75,8 @@ class RunReport:
     rmse_mm: Mean = field(default_factory=Mean)
     truth_rmse_mm: Mean = field(default_factory=Mean)
     sensor_rmse_mm: Mean = field(default_factory=Mean)
-    known: Mean = field(default_factory=Mean)
-    measured: Mean = field(default_factory=Mean)
+    known_percent: Mean = field(default_factory=Mean)
+    measured_percent: Mean = field(default_factory=Mean)
     even_rmse_mm: Mean = field(default_factory=Mean)
     troubles: list[str] = field(default_factory=list)
     written: list[Path] = field(default_factory=list)
@@ -90,26 +91,19 @@ class RunReport:
         """What selecting was worth, in a line; empty where nothing was held against an even lattice."""
         if not self.even_rmse_mm.count:
             return ""
-        remembered = self.known.count and self.truth_rmse_mm.count
+        remembered = self.known_percent.count and self.truth_rmse_mm.count
         rmse_mm, even_mm = (self.truth_rmse_mm if remembered else self.rmse_mm).value, self.even_rmse_mm.value
         times = f"{even_mm / max(rmse_mm, 1e-9):.1f} times as good"
-        return f"{self.measured.value:.1%} of the pixels · {rmse_mm:.1f} mm · even lattice {even_mm:.1f} mm · {times}"
+        return f"{self.measured_percent.value:.1f}% of the pixels · {rmse_mm:.1f} mm · even lattice {even_mm:.1f} mm · {times}"
 
     def take(self, result: FrameResult) -> None:
         """Add a frame's result."""
         self.frames += 1
-        self.samples.add(result.samples)
-        self.quantisation_error_mm.add(result.regions.quantisation_error_mm)
         if result.acquisition is not None:
             self.by = result.acquisition.by
-            self.measured.add(len(result.acquisition.uv) / result.frame.depth_mm.size)
-        if result.model is not None:
-            self.even_rmse_mm.add(result.model.even_rmse_mm)
-            self.rmse_mm.add(result.model.rmse_mm)
-            self.truth_rmse_mm.add(result.model.truth_rmse_mm)
-            self.sensor_rmse_mm.add(result.model.sensor_rmse_mm)
-        if result.memory is not None:
-            self.known.add(float(result.memory.known.mean()))
+        for name, value in figures_of(result).items():
+            if isinstance(mean := getattr(self, name, None), Mean):
+                mean.add(value)
 
 
 def say(sentence: str) -> None:
@@ -142,8 +136,8 @@ def print_report(report: RunReport) -> None:
     if report.truth_rmse_mm.count:
         table.add_row("", f"{report.truth_rmse_mm.value:.1f}", "mm to the truth")
         table.add_row("whole frame", f"{report.sensor_rmse_mm.value:.1f}", "mm to the truth")
-    if report.known.count:
-        table.add_row("pixels known", f"{report.known.value:.1%}", "on average")
+    if report.known_percent.count:
+        table.add_row("pixels known", f"{report.known_percent.value:.1f}%", "on average")
     console.print(table)
     if report.gain:
         console.print(f"\n{report.gain}", style="bold")

@@ -34,6 +34,8 @@ class Model:
     even_rmse_mm : float
         The same as `rmse_mm`, or with a memory as `truth_rmse_mm`, of an even lattice of as many
         measurements; NaN where none was made.
+    mae_mm : float
+        Mean of `error_mm`; NaN for a frame without depth.
     """
 
     depth_mm: npt.NDArray[np.float32]
@@ -42,6 +44,7 @@ class Model:
     truth_rmse_mm: float = math.nan
     sensor_rmse_mm: float = math.nan
     even_rmse_mm: float = math.nan
+    mae_mm: float = math.nan
 
     @classmethod
     def of(cls, depth_mm: npt.NDArray[np.float32], frame: DepthFrame, even_rmse_mm: float = math.nan) -> Model:
@@ -54,7 +57,9 @@ class Model:
             seen = known & (frame.truth_mm > 0)
             truth_mm = frame.truth_mm[seen].astype(np.float32)
             to_truth = _rms(depth_mm[seen] - truth_mm), _rms(frame.depth_mm[seen] - truth_mm)
-        return cls(depth_mm, error_mm, _rms(error_mm[known]), *to_truth, even_rmse_mm)
+        off_mm = error_mm[known]
+        mae_mm = float(off_mm.mean(dtype=np.float64)) if off_mm.size else math.nan
+        return cls(depth_mm, error_mm, _rms(off_mm), *to_truth, even_rmse_mm, mae_mm)
 
 
 def _rms(off_mm: npt.NDArray[np.floating]) -> float:

@@ -32,6 +32,13 @@ _MODES: Final = {"1": "a 1-bit grey", "L": "an 8-bit grey", "P": "a palette", "L
 _NEXT: Final = "depth frames are 16-bit grey PNG; convert this file or remove it from the folder"
 
 
+def is_depth_png(path: Path) -> bool:
+    """Whether an image is no picture for people: no PNG file of 8 bits or in colour."""
+    with path.open("rb") as file:
+        header = file.read(HEADER_BYTES)
+    return not header.startswith(SIGNATURE) or header[24:26] == b"\x10\x00"
+
+
 def read_raw(path: Path) -> npt.NDArray[Any]:
     """Values of a depth image of any kind.
 

@@ -147,6 +147,10 @@ class RecordedFolder(DepthSource):
         self._ahead = self._reader.submit(self._load, self._next) if more else None
         return frame
 
+    def skip(self, frames: int) -> None:
+        """Leave out frames without looking at them; before the first `read`."""
+        self._next = min(self._next + frames, len(self._files))
+
     def close(self) -> None:
         """Stop reading ahead."""
         self._closed = True

@@ -140,6 +140,10 @@ class VirtualSource(DepthSource):
         seen = kinect_depth(nearness, material, _ALBEDO, self.camera, frame_seed, fixed_seed)
         return seen, exact, colour
 
+    def skip(self, frames: int) -> None:
+        """Leave out frames, none of which depends on another."""
+        self._next += frames
+
     def close(self) -> None:
         """No frame follows."""
         self._closed = True
