@@ -37,6 +37,8 @@ class DepthSource(ABC):
         What it is read as, in one sentence, where that is not plain; the first line of a run.
     notes : tuple of str
         What a user should know of it, a sentence each: what is missing, what was assumed.
+    damage : str
+        Why a recording is not whole, in a sentence, where that is known before its frames are read.
     """
 
     uri: str
@@ -48,6 +50,7 @@ class DepthSource(ABC):
     state: str = "live"
     about: str = ""
     notes: tuple[str, ...] = ()
+    damage: str = ""
     _opened_by: int
 
     def __new__(cls, *_: object, **__: object) -> Self:

@@ -48,8 +48,9 @@ class Recording(NamedTuple):
 class Keeper(Protocol):
     """What is kept of a recording besides its table; it is sent to the workers."""
 
-    whole: bool
-    """Whether it needs all frames of a recording, in their order."""
+    @property
+    def whole(self) -> bool:
+        """Whether it needs all frames of a recording, in their order."""
 
     def keeping(
         self, stem: Path, source: DepthSource, frames: int, settings: Settings
@@ -221,7 +222,8 @@ def _do_frames(job: Job, recording: Recording, source: DepthSource, span: range,
             if time.monotonic() - said_s > TELL_S:
                 said_s = time.monotonic()
                 tell((f"{recording.name} {span.start}", table.rows))
-    failure = str(feed.damage) if feed.damage else None if table.rows else f"'{recording.source}' holds no frame."
+    empty = "" if table.rows else f"'{recording.source}' holds no frame."
+    failure = str(feed.damage or source.damage or empty) or None
     state = "whole" if failure is None else "damaged" if table.rows else "failed"
     return {"state": state, "failure": failure, "colour": colour}
 

@@ -184,6 +184,7 @@ def _print(summary: pa.Table, batch: Batch, seconds: float, out: Path) -> None:
     before = f", {batch.skipped:,} of them done before" if batch.skipped else ""
     console.print(
         f"{batch.done:,} recordings ({batch.failures:,} not whole{before}), {pc.sum(summary['frames']).as_py() or 0:,}"
-        f" frames; {batch.frames:,} frames in {seconds:.1f} s, {batch.frames / max(seconds, 1e-9):.1f} frames/s"
+        f" frames; {batch.frames:,} frames in {seconds:.1f} s, {batch.frames / max(seconds, 1e-9):.1f} frames/s",
+        soft_wrap=True,
     )
     say(f"wrote {out / SUMMARY_FILE}")

@@ -94,7 +94,8 @@ class RunReport:
         remembered = self.known_percent.count and self.truth_rmse_mm.count
         rmse_mm, even_mm = (self.truth_rmse_mm if remembered else self.rmse_mm).value, self.even_rmse_mm.value
         times = f"{even_mm / max(rmse_mm, 1e-9):.1f} times as good"
-        return f"{self.measured_percent.value:.1f}% of the pixels · {rmse_mm:.1f} mm · even lattice {even_mm:.1f} mm · {times}"
+        measured = f"{self.measured_percent.value:.1f}% of the pixels"
+        return f"{measured} · {rmse_mm:.1f} mm · even lattice {even_mm:.1f} mm · {times}"
 
     def take(self, result: FrameResult) -> None:
         """Add a frame's result."""

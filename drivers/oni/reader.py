@@ -68,6 +68,8 @@ class OniReader(DepthSource):
                 f"'{path}' is not whole ({self.report.problems[0]}); `selective-depth check` says"
                 " more, and saves what can be saved with --repair.",
             )
+        if any(not problem.harmless for problem in self.report.problems):
+            self.damage = self.notes[0]
         self.notes += tuple(f"'{path}': {note}." for note in self.report.notes)
         self._frames, self._damage = _trusted_frames(self.report)
         if self._damage is not None and not self._frames:
