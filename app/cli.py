@@ -138,9 +138,10 @@ def devices() -> int:
     "Files",
     (f"{PROGRAM} check walk.oni", "what is wrong with it and where, how much is readable"),
     (f"{PROGRAM} check walk.oni --repair whole.oni", "and save what is readable"),
+    (f"{PROGRAM} check archive/ 'day2/*.oni'", "every recording in there, in a table"),
 )
 def check(
-    file: Annotated[Path, arg(metavar="FILE.oni")],
+    sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
     repair: Annotated[Path | None, optional("OUT.oni")] = None,
     timeout: Annotated[Positive, arg(metavar="SECONDS")] = 10.0,
@@ -149,16 +150,16 @@ def check(
 
     Parameters
     ----------
-    file : Path
-        The recording.
+    sources : tuple of str
+        Recordings, or folders that hold some; of those that are no .oni file every frame is read.
     repair : Path
-        Write what is readable to this new file, which OpenNI2 replays.
+        Write what is readable of one .oni file to this new file, which OpenNI2 replays.
     timeout : float
-        Look at it for so long at most.
+        Look at an .oni file for so long at most.
     """
-    from selective_depth.app.commands.files import check_file
+    from selective_depth.app.commands.files import check as look
 
-    return check_file(file, repair=repair, timeout_s=timeout)
+    return look(sources, repair=repair, timeout_s=timeout)
 
 
 @command(
@@ -166,23 +167,23 @@ def check(
     (f"{PROGRAM} export walk.oni frames/", "as 16-bit PNG files; all that is readable"),
     (f"{PROGRAM} export frames/ walk.oni", "an .oni file out of PNG files"),
     (f"{PROGRAM} export virtual:ball ball.oni --frames 90", "of any source"),
+    (f"{PROGRAM} export archive/ walk.oni out/", "of several: a folder of PNG files each"),
 )
-def export(source: Source, out: Annotated[Path, arg(metavar="OUT")], /, frames: Limit = None) -> int:
+def export(paths: Annotated[tuple[str, ...], optional("SOURCE... OUT")], /, frames: Limit = None) -> int:
     """Save a source's frames as PNG files, an .oni file or a ROS 2 bag; needs no OpenNI2.
 
     Parameters
     ----------
-    source : str
-        Anything that 'replay' takes.
-    out : Path
-        A new folder for PNG files and their sidecar, a new file that ends in .oni or .mcap, or a
-        folder that ends in .ros2.
+    paths : tuple of str
+        Anything that 'replay' takes, and OUT: a new folder for PNG files and their sidecar, a new
+        file that ends in .oni or .mcap, or a folder that ends in .ros2. Of several sources, or of
+        a folder that holds some, OUT gets a folder of PNG files for each.
     frames : int
-        Stop after this many frames.
+        Stop after this many frames of each.
     """
-    from selective_depth.app.commands.files import export as save
+    from selective_depth.app.commands.files import export_all
 
-    return save(source, out, frames)
+    return export_all(paths, frames)
 
 
 @command(

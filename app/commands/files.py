@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
+from selective_depth.app.archive.batch import recordings
+from selective_depth.app.archive.unit import Recording
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, OK
+from selective_depth.app.console.output import make_folder
 from selective_depth.app.console.progress import FrameProgress, waiting
-from selective_depth.app.pipeline import open_and_tell, say
+from selective_depth.app.pipeline import Feed, open_and_tell, say
+from selective_depth.drivers.errors import SourceError
 from selective_depth.drivers.folder import FolderWriter
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni import OniReport, OniWriter, export_oni, inspect_oni, repair_oni
+from selective_depth.drivers.open import open_source
+from selective_depth.drivers.options import parted
+from selective_depth.drivers.search import FILES
 from selective_depth.drivers.source import DepthSource
 
 if TYPE_CHECKING:
@@ -28,8 +37,8 @@ BAGS = (".mcap", ".ros2")
 """Endings of an MCAP file, and of the folder of a ROS 2 bag."""
 
 
-def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
-    """Print what is in an .oni file and what is wrong with it; save what is readable if asked.
+def check(sources: Sequence[str], *, repair: Path | None, timeout_s: float) -> int:
+    """Print what is wrong with recordings: all about one .oni file, or a line of each of several.
 
     Returns
     -------
@@ -38,6 +47,56 @@ def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
     """
     if not timeout_s > 0:
         raise UsageError(f"--timeout is {timeout_s:g}; it must be more than 0.")
+    found = list(recordings(sources))
+    if len(found) == len(sources) == 1 and not Path(found[0].source).is_dir():
+        return check_file(Path(parted(sources[0])[0]), repair=repair, timeout_s=timeout_s)
+    if repair is not None or not found:
+        raise UsageError("--repair mends one .oni file." if found else "no recording was named; give files or folders.")
+    return _several("Checking", found, lambda each: _look(each.source, timeout_s))
+
+
+def _several(doing: str, found: Sequence[Recording], do: Callable[[Recording], tuple[int, str]]) -> int:
+    """Do something with each of several recordings and print what came of it; returns the exit code."""
+    table = Table(box=None, pad_edge=False)
+    for name, side in (("recording", "left"), ("frames", "right"), ("", "left")):
+        table.add_column(name, justify=side, overflow="fold")  # type: ignore[arg-type]
+    wrong = 0
+    with FrameProgress(doing, None) as progress:
+        for at, each in enumerate(found, start=1):
+            try:
+                frames, trouble = do(each)
+            except SourceError as error:
+                frames, trouble = 0, str(error)
+            wrong += bool(trouble)
+            table.add_row(each.name, f"{frames:,}", Text(trouble or "whole"))
+            progress.update(at, f"of the recording{'s' * (len(found) > 1)}")
+    Console(highlight=False).print(table)
+    say(f"{len(found):,} recordings, {wrong:,} not whole")
+    return FAILED if wrong else OK
+
+
+def _look(source: str, timeout_s: float) -> tuple[int, str]:
+    """How many frames are readable, and what is wrong."""
+    path = Path(parted(source)[0])
+    if path.suffix.lower() == ".oni":
+        report = inspect_oni(path, decode=True, timeout_s=timeout_s)
+        return report.readable_frames, "" if report.complete else _verdict(report)
+    with open_source(source) as opened:
+        if opened.frame_count is None:
+            raise SourceError(f"'{source}' never ends: there is nothing to check.")
+        feed = Feed(opened)
+        frames = sum(1 for _ in feed)
+        return frames, str(feed.damage or opened.damage or "" if frames else f"'{source}' holds no frame")
+
+
+def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
+    """Print what is in an .oni file and what is wrong with it; save what is readable if asked.
+
+    Returns
+    -------
+    int
+        Exit code: 0 if nothing is wrong (or a repaired file was written), else 1.
+    """
     with waiting(f"Checking {path}"):
         report = inspect_oni(path, decode=True, timeout_s=timeout_s)
     _print_check(report)
@@ -61,6 +120,33 @@ def check_file(path: Path, *, repair: Path | None, timeout_s: float) -> int:
     return OK if report.complete else FAILED
 
 
+def export_all(paths: Sequence[str], frames: int | None) -> int:
+    """Export one source, or each of several into a folder of its own below the last path.
+
+    Returns
+    -------
+    int
+        Exit code: 0, or 1 if one of several is not whole or cannot be written.
+    """
+    if len(paths) < 2:
+        raise UsageError("give what to export and where to, as in: export walk.oni frames/")
+    *sources, last = paths
+    out = Path(last)
+    found = list(recordings(sources, out))
+    if len(found) == len(sources) == 1 and Path(found[0].source) in (Path(sources[0]), Path(sources[0]).absolute()):
+        return export(sources[0], out, frames)
+    make_folder(out)
+
+    def save(each: Recording) -> tuple[int, str]:
+        folder = out / Path(each.name).with_suffix("") if each.name.lower().endswith(FILES) else out / each.name
+        make_folder(folder.parent)
+        with open_source(each.source) as source:
+            damage = source.damage
+        return _export(each.source, folder, frames, FrameProgress(each.name, None)), damage
+
+    return _several(f"Writing {out}", found, save)
+
+
 def export(source: str, out: Path, frames: int | None) -> int:
     """Save the frames of any source as a folder of PNG files, an .oni file or a ROS 2 bag.
 
@@ -79,22 +165,29 @@ def export(source: str, out: Path, frames: int | None) -> int:
             f"'{out}' ends in {ending}, which export does not write; give the name of a folder, for"
             " PNG files, or one that ends in .oni, .mcap or .ros2."
         )
-    recording, to_oni = Path(source).suffix.lower() == ".oni", ending == ".oni"
     with FrameProgress(f"Writing {out}", frames) as progress:
-        if recording and to_oni and frames is None:
-            count = repair_oni(source, out).readable_frames
-        elif recording and not to_oni and ending not in BAGS:
-            readable = export_oni(source, out, progress.update, frames=frames).readable_frames
-            count = readable if frames is None else min(readable, frames)
-        else:
-            with open_and_tell(source) as opened:
-                for note in opened.notes:
-                    say(f"note: {note}")
-                if opened.frame_count is None and frames is None:
-                    raise UsageError(f"'{source}' never ends; say how many frames to save, as in --frames 100.")
-                count = _save(opened, out, frames, progress)
+        count = _export(source, out, frames, progress)
     say(f"wrote {out}: {count} frames")
     return OK
+
+
+def _export(source: str, out: Path, frames: int | None, progress: FrameProgress) -> int:
+    """Save them; returns how many."""
+    ending = out.suffix.lower()
+    recording, to_oni = Path(source).suffix.lower() == ".oni", ending == ".oni"
+    if recording and to_oni and frames is None:
+        count = repair_oni(source, out).readable_frames
+    elif recording and not to_oni and ending not in BAGS:
+        readable = export_oni(source, out, progress.update, frames=frames).readable_frames
+        count = readable if frames is None else min(readable, frames)
+    else:
+        with open_and_tell(source) as opened:
+            for note in opened.notes:
+                say(f"note: {note}")
+            if opened.frame_count is None and frames is None:
+                raise UsageError(f"'{source}' never ends; say how many frames to save, as in --frames 100.")
+            count = _save(opened, out, frames, progress)
+    return count
 
 
 def _save(source: DepthSource, out: Path, frames: int | None, progress: FrameProgress) -> int:

@@ -48,8 +48,8 @@ _SOURCE_HELP = (
     "  --colour WORD        off; registered or unregistered, as it lies on depth; or the colour",
     "                       camera as FX,FY,CX,CY,X,Y,Z, its place in mm beside that of depth",
 )
-SOURCES = ("source", "sources", "device")
-"""Parameters of commands that name what `open_source` opens."""
+SOURCES = ("source", "sources", "device", "paths")
+"""Parameters of commands that name what `open_source` opens; the last of the paths is where it goes."""
 Run = Callable[..., int | None]
 Example = tuple[str, str]
 
@@ -223,9 +223,11 @@ def with_source_options(call: Callable[[], int | None], given: dict[str, str]) -
 
     for name in names:
         value = bound.arguments[name]
-        bound.arguments[name] = (
-            appended(value, given) if isinstance(value, str) else tuple(appended(each, given) for each in value)
-        )
+        if isinstance(value, str):
+            bound.arguments[name] = appended(value, given)
+        else:
+            end = len(value) - (name == "paths")
+            bound.arguments[name] = (*(appended(each, given) for each in value[:end]), *value[end:])
     return functools.partial(run, *bound.args, **bound.kwargs)
 
 
@@ -240,6 +242,11 @@ def _one_line(boxed: str, name: str) -> str:
         (r"^Error parsing (\S+):.* instantiated from \['(.*?)'\]\..*", r"\1 cannot be '\2'"),
         (r"^Missing value for argument '(\S+)'.*", r"\1 needs a value"),
         (r"^Unrecognized options: (.*?) Perhaps you meant: (\S+).*", r"\1: did you mean \2?"),
+        (
+            r"^Unrecognized options: (?=[^- ])",
+            "it takes one source; 'batch' takes several. Too much is " * (name == "replay")
+            or f"'{name}' does not take ",
+        ),
         (r"^Unrecognized options: ", f"'{name}' does not take "),
         (rf"^Missing from {PROGRAM} {name}: ", "missing: "),
     ):
