@@ -81,6 +81,7 @@ Positive = Annotated[float, positive]
 TimeLimit = Annotated[float | None, positive, optional("SECONDS")]
 _SIZE = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%")
 Memory = Annotated[str, must_be("a size, such as 256MiB or 25%", str, _SIZE.fullmatch), arg(metavar="SIZE")]
+Scheduler = Annotated[str | None, optional("ADDRESS|FILE")]
 Millimetres = Annotated[int | None, whole(0, 65535), optional("MM")]
 
 
@@ -213,10 +214,11 @@ class ComparisonOptions:
     """How often strategies that draw at random are run."""
     jobs: Limit = None
     """Processes; by default one per processor."""
+    scheduler: Scheduler = None
+    """A Dask scheduler, whose workers do the work instead: its address or its file."""
 
 
 Keep = Annotated[tuple[Literal["masks", "maps", "depth"], ...], arg(metavar="masks|maps|depth...")]
-Scheduler = Annotated[str | None, optional("tcp://HOST:PORT|FILE")]
 
 
 @dataclass(frozen=True)

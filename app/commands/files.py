@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from selective_depth.drivers.bag import BagWriter
 
 MOST_PROBLEMS = 20
+LOOK_S = 600.0
+"""For so long at most a recording is looked at before it is exported."""
 OTHER_FILES = (".npz", ".npy", ".png", ".rrd", ".ply", ".bag", ".db3", ".pdf", ".svg", ".webp")
 """Endings of files that a folder's name must not have by mistake."""
 BAGS = (".mcap", ".ros2")
@@ -140,9 +142,9 @@ def export_all(paths: Sequence[str], frames: int | None) -> int:
     def save(each: Recording) -> tuple[int, str]:
         folder = out / Path(each.name).with_suffix("") if each.name.lower().endswith(FILES) else out / each.name
         make_folder(folder.parent)
-        with open_source(each.source) as source:
-            damage = source.damage
-        return _export(each.source, folder, frames, FrameProgress(each.name, None)), damage
+        oni = parted(each.source)[0].lower().endswith(".oni")  # of which all that is readable is saved
+        trouble = _look(each.source, LOOK_S)[1] if oni else ""
+        return _export(each.source, folder, frames, FrameProgress(each.name, None)), trouble
 
     return _several(f"Writing {out}", found, save)
 

@@ -236,17 +236,15 @@ def _one_line(boxed: str, name: str) -> str:
     lines = [re.sub("[╭╮╰╯│─]", "", line).strip() for line in boxed.splitlines()]
     words = " ".join([line for line in lines if line.strip("-")][1:])
     words = re.split(r" (?:Argument|For full) helptext", words)[0].replace("(required)", "")
+    if name == "replay":
+        one = r"'replay' takes one source, and '\1' is another; 'batch' takes several"
+        words = re.sub(r"^Unrecognized options: ([^- ]\S*).*", one, words)
     for parsers, ours in (
         (r"^Error parsing (\S+): is ", r"\1 is "),  # the rest is ours already, of settings.py
         # Of a value of the wrong type it tells how it tried each type.
         (r"^Error parsing (\S+):.* instantiated from \['(.*?)'\]\..*", r"\1 cannot be '\2'"),
         (r"^Missing value for argument '(\S+)'.*", r"\1 needs a value"),
         (r"^Unrecognized options: (.*?) Perhaps you meant: (\S+).*", r"\1: did you mean \2?"),
-        (
-            r"^Unrecognized options: (?=[^- ])",
-            "it takes one source; 'batch' takes several. Too much is " * (name == "replay")
-            or f"'{name}' does not take ",
-        ),
         (r"^Unrecognized options: ", f"'{name}' does not take "),
         (rf"^Missing from {PROGRAM} {name}: ", "missing: "),
     ):

@@ -13,11 +13,12 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 
 import numpy as np
 
+from selective_depth.app.archive.engine import engine
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of, strategy_of
@@ -165,6 +166,7 @@ def outcomes(
     random_seeds: int = 3,
     strategies: Sequence[str] = ("all",),
     jobs: int | None = None,
+    scheduler: str | None = None,
     settings: Settings | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Outcome]:
@@ -188,6 +190,8 @@ def outcomes(
         As `strategies_of` takes them; default all. "uniform" and "oracle" are always run.
     jobs : int, optional
         Processes; default one per processor, and 1 runs in this one.
+    scheduler : str, optional
+        Of a Dask cluster that does the work instead, as for `archive.engine`.
     settings : Settings, optional
         Of the seeds, and of the two published selectors.
     progress : callable, optional
@@ -217,7 +221,11 @@ def outcomes(
 
     progress(0, total)
     chosen = enumerate(frames_of(sources, every, frames))
-    if min(jobs, total) == 1:
+    if scheduler is not None:
+        with engine(scheduler) as client:
+            workers = max(1, sum(client.nthreads().values()))
+            _through(client.get_executor(pure=False), chosen, arguments, workers, keep)
+    elif min(jobs, total) == 1:
         for number, frame in chosen:
             keep(number, _evaluate_frame(frame, *arguments))
     else:
@@ -249,28 +257,38 @@ def _spread(
     spawn = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_worker)
-    under_way: dict[Future[list[Outcome]], int] = {}
-
-    def settle() -> None:
-        for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-            keep(under_way.pop(future), future.result())
-
     done = False
     try:
-        for number, frame in chosen:
-            # A worker whose start is cut short reports that nobody told it what to do.
-            with interrupt.deferred(), interrupt.started_deaf():
-                under_way[pool.submit(_evaluate_frame, frame, *arguments)] = number
-            if len(under_way) == 2 * jobs:
-                settle()
-        while under_way:
-            settle()
+        _through(pool, chosen, arguments, jobs, keep)
         done = True
     finally:
         if not done:  # after Ctrl-C, say: what is under way is not waited for
             for worker in set(multiprocessing.active_children()) - others:
                 worker.kill()
         pool.shutdown(wait=done, cancel_futures=True)
+
+
+def _through(
+    pool: Executor,
+    chosen: Iterator[tuple[int, DepthFrame]],
+    arguments: _Arguments,
+    jobs: int,
+    keep: Callable[[int, list[Outcome]], None],
+) -> None:
+    under_way: dict[Future[list[Outcome]], int] = {}
+
+    def settle() -> None:
+        for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+            keep(under_way.pop(future), future.result())
+
+    for number, frame in chosen:
+        # A worker whose start is cut short reports that nobody told it what to do.
+        with interrupt.deferred(), interrupt.started_deaf():
+            under_way[pool.submit(_evaluate_frame, frame, *arguments)] = number
+        if len(under_way) == 2 * jobs:
+            settle()
+    while under_way:
+        settle()
 
 
 def summarise(found: Sequence[Outcome]) -> Results:

@@ -74,6 +74,7 @@ def run_evaluation(
             random_seeds=options.random_seeds,
             strategies=options.strategies,
             jobs=options.jobs,
+            scheduler=options.scheduler,
             settings=settings,
             progress=lambda done, total: bar.update(done, f"of {total}"),
         )
