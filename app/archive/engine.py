@@ -6,7 +6,6 @@ The only module that imports it; it is an optional extra.
 from __future__ import annotations
 
 import importlib.util
-import logging
 import multiprocessing
 import os
 import queue
@@ -56,7 +55,8 @@ def engine(scheduler: str | None = None, workers: int | None = None) -> Iterator
         raise AppError("this needs Dask, which is not installed: pip install 'selective-depth[batch]'.")
     import dask
 
-    with dask.config.set({} if logging.getLogger().isEnabledFor(logging.INFO) else _QUIET):
+    os.environ["DASK_LOGGING__DISTRIBUTED"] = "critical"  # of the workers; what matters comes as a result
+    with dask.config.set(_QUIET):
         if scheduler is not None:
             with _there(scheduler) as client:
                 yield client

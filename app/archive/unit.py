@@ -170,7 +170,7 @@ def do_range(job: Job, recording: Recording, cut: Cut, at: int) -> dict[str, Any
         return found
     with open_source(recording.source) as source, writing(path, job.stated) as table:
         source.skip(span.start)
-        about = _do_frames(job, recording, source, span, table)
+        about = _do_frames(job, recording, source, span, table, last=span.stop == cut.stop)
         return table.finish(cut.key, about | {"work_s": time.perf_counter() - began_s})
 
 
@@ -194,7 +194,9 @@ def join(job: Job, recording: Recording, cut: Cut, ranges: list[dict[str, Any]])
 _warm = False
 
 
-def _do_frames(job: Job, recording: Recording, source: DepthSource, span: range, table: FigureTable) -> dict[str, Any]:
+def _do_frames(
+    job: Job, recording: Recording, source: DepthSource, span: range, table: FigureTable, *, last: bool = True
+) -> dict[str, Any]:
     """Every frame through the pipeline, to the table and what is kept; returns what there is to say."""
     global _warm
     said_s = time.monotonic()
@@ -223,7 +225,7 @@ def _do_frames(job: Job, recording: Recording, source: DepthSource, span: range,
                 said_s = time.monotonic()
                 tell((f"{recording.name} {span.start}", table.rows))
     empty = "" if table.rows else f"'{recording.source}' holds no frame."
-    failure = str(feed.damage or source.damage or empty) or None
+    failure = str(feed.damage or (source.damage if last else "") or empty) or None
     state = "whole" if failure is None else "damaged" if table.rows else "failed"
     return {"state": state, "failure": failure, "colour": colour}
 

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -27,6 +26,7 @@ from selective_depth.app.console.progress import FrameProgress
 from selective_depth.app.pictures import StillRow, contact_sheet, write_picture
 from selective_depth.app.pictures.palette import FIGURES
 from selective_depth.app.pipeline import FrameResult, StageTimes, figures_of, say
+from selective_depth.app.pipeline.selecting import selector_of
 from selective_depth.app.settings import BatchOptions, Settings, ViewerOptions
 from selective_depth.drivers.source import DepthSource
 
@@ -129,7 +129,8 @@ def run_batch(sources: Sequence[str], out: Path, options: BatchOptions, settings
         raise UsageError(f"--out is '{out}', which holds the recordings; name another folder.")
     if not settings.acquire.budget and (options.models or "depth" in options.keep):
         raise UsageError("--models and --keep depth are of what a --budget acquires; give one, such as 5%.")
-    cv2.setNumThreads(1)
+    selector_of(settings, 1)  # refuses what there is not
+    make_folder(out)
     file, colon, name = settings.acquire.by.rpartition(":")
     by = f"{Path(file).absolute()}:{name}" if colon else name
     settings = dataclasses.replace(
