@@ -25,10 +25,10 @@ START = (sys.executable, "-m", "selective_depth.app")
 TIMES = re.compile(r"_ms$|_s$")
 
 
-def write(path: Path, scene: str, frames: int, seed: int, colour: bool = False) -> None:
-    """A recording of a made scene, 64x48."""
+def write(path: Path, scene: str, frames: int, seed: int, colour: bool = False, size: str = "64x48") -> None:
+    """A recording of a made scene."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    uri = f"virtual:{scene}?frames={frames}&seed={seed}&size=64x48{'' if colour else '&colour=off'}"
+    uri = f"virtual:{scene}?frames={frames}&seed={seed}&size={size}{'' if colour else '&colour=off'}"
     writer = (OniWriter if path.suffix == ".oni" else FolderWriter)(path, fps=30.0)
     with open_source(uri) as source, writer:
         for frame in source:

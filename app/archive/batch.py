@@ -21,7 +21,7 @@ from selective_depth.app.archive.unit import WORK, Cut, Job, Recording, do_range
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.dispatch import sentence_of
 from selective_depth.app.console.errors import AppError, UsageError
-from selective_depth.app.console.output import cannot_write, make_folder
+from selective_depth.app.console.output import cannot_write, lock, make_folder
 from selective_depth.app.console.tables import write_table
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.options import parted
@@ -127,6 +127,12 @@ class Batch:
         """
         out = self.job.out
         make_folder(out / WORK)
+        with (out / WORK / "lock").open("ab") as held:
+            if not lock(held):
+                raise UsageError(f"another run writes to '{out}'; wait for it, or name another --out.")
+            return self._run(client, out, progress)
+
+    def _run(self, client: Client, out: Path, progress: Callable[[Stream], None]) -> pa.Table:
         for left in out.rglob(".????????????.part"):  # of a run that was killed
             with suppress(OSError):
                 left.unlink()

@@ -6,6 +6,7 @@ import errno
 import os
 import secrets
 import shutil
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -123,6 +124,20 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         if part is not None:
             with suppress(OSError):  # renamed, or never made
                 part.unlink()
+
+
+def lock(file: BinaryIO) -> bool:
+    """Keep other runs from a file for as long as it is open; False if one has it."""
+    if sys.platform != "win32":
+        import fcntl
+
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True  # a file system without locks
+    return True
 
 
 def write_output(path: Path, data: bytes | str) -> None:

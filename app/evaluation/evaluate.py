@@ -165,8 +165,7 @@ def outcomes(
     rounds: int = 8,
     random_seeds: int = 3,
     strategies: Sequence[str] = ("all",),
-    jobs: int | None = None,
-    scheduler: str | None = None,
+    jobs: int | str | None = None,
     settings: Settings | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Outcome]:
@@ -188,10 +187,9 @@ def outcomes(
         How often strategies that draw at random are run.
     strategies : sequence of str, optional
         As `strategies_of` takes them; default all. "uniform" and "oracle" are always run.
-    jobs : int, optional
-        Processes; default one per processor, and 1 runs in this one.
-    scheduler : str, optional
-        Of a Dask cluster that does the work instead, as for `archive.engine`.
+    jobs : int or str, optional
+        Processes; default one per processor, and 1 runs in this one. Or the scheduler of a Dask
+        cluster, as for `archive.engine`.
     settings : Settings, optional
         Of the seeds, and of the two published selectors.
     progress : callable, optional
@@ -221,8 +219,8 @@ def outcomes(
 
     progress(0, total)
     chosen = enumerate(frames_of(sources, every, frames))
-    if scheduler is not None:
-        with engine(scheduler) as client:
+    if isinstance(jobs, str):
+        with engine(jobs) as client:
             workers = max(1, sum(client.nthreads().values()))
             _through(client.get_executor(pure=False), chosen, arguments, workers, keep)
     elif min(jobs, total) == 1:

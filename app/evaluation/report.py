@@ -73,8 +73,7 @@ def run_evaluation(
             rounds=rounds,
             random_seeds=options.random_seeds,
             strategies=options.strategies,
-            jobs=options.jobs,
-            scheduler=options.scheduler,
+            jobs=options.scheduler or options.jobs,
             settings=settings,
             progress=lambda done, total: bar.update(done, f"of {total}"),
         )

@@ -5,19 +5,17 @@ from __future__ import annotations
 import os
 import shutil
 import socket
-import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 from urllib.parse import urlsplit
 
 import rerun as rr
 
 from selective_depth.app.console.errors import ViewerError
-from selective_depth.app.console.output import cannot_write
+from selective_depth.app.console.output import cannot_write, lock
 from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.stream import WRITE_S, Recording
@@ -134,7 +132,7 @@ class FilePlace(Place):
             free = shutil.disk_usage(path.parent).free
         except OSError as error:
             raise cannot_write(path, error) from None
-        if not _lock(self._held):
+        if not lock(self._held):
             raise OutputError(f"another run is writing '{path}'; name another file.")
         if free < 2 * SPARE_BYTES:
             self.discard()
@@ -319,20 +317,6 @@ class WindowPlace(RemotePlace):
         self._meet()
         super().open()
         self.put(item)
-
-
-def _lock(file: BinaryIO) -> bool:
-    """Keep other runs from writing a file, for as long as it is open; False if one does."""
-    if sys.platform != "win32":
-        import fcntl
-
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError:
-            return True  # a file system without locks
-    return True
 
 
 def _host_and_port(url: str) -> tuple[str, int]:

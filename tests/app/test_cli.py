@@ -143,7 +143,7 @@ def test_completion_knows_the_commands(shell: str, capsys: pytest.CaptureFixture
         (["model", "x", "out", "--frame", "-1"], "--frame is -1; it must be 0 or more"),
         (["snapshot", "x", "--dpi", "0"], "--dpi is 0; it must be from 10 to 2,400"),
         (["--completion", "fish"], "bash and zsh, not for 'fish'"),
-        (["replay", "x", "y"], "'replay' does not take y. "),
+        (["replay", "x", "y"], "'replay' takes one source, and 'y' is another; 'batch' takes several. "),
         (["replay", "x", "--gas.nods", "3"], "--gas.nods, 3: did you mean --gas.nodes?"),
         (["replay", "x", "--gas.nodes", "many"], "--gas.nodes"),
         (["replay", "x", "--gas.algorithm", "slow"], "'exact', 'fast'"),

@@ -14,10 +14,13 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from archives import QUICK, Archive, Done, batch, children, finish, kill, same, start, tables, wait_for, write
+from archives import QUICK, START, Archive, Done, batch, children, finish, kill, same, start, tables, wait_for, write
 
 from selective_depth.app import cli
+from selective_depth.app.archive import Batch, Job
+from selective_depth.app.commands.batch import Keeping
 from selective_depth.app.commands.run import Session
+from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline import figures_of
 from selective_depth.app.settings import AcquireOptions, GasOptions, SeedOptions, Settings, ViewerOptions
 
@@ -116,6 +119,8 @@ def _killed_at_times(archive: Archive, expected: Path, out: Path, counts: list[i
 def test_killed_worker(archive: Archive, undisturbed: tuple[Path, Done], tmp_path: Path) -> None:
     process = start(archive.path, "--out", tmp_path, *QUICK)
     wait_for(lambda: made(tmp_path) > 10)
+    with pytest.raises(UsageError, match="another run writes to"):
+        Batch(Job(tmp_path, SETTINGS, Keeping()), []).run(None)
     os.kill(max(children(process.pid)), signal.SIGKILL)
     done = finish(process)
     assert done.code == 1
@@ -168,8 +173,10 @@ def test_scheduler_and_workers_of_their_own(archive: Archive, undisturbed: tuple
         address = json.loads(file.read_text())["address"]
         assert batch(archive.path, "--out", tmp_path / "out", *QUICK, "--scheduler", address).code == 1
         same(tables(tmp_path / "out"), tables(undisturbed[0]))
-        done = batch("virtual:ball?frames=2&size=64x48", "--out", tmp_path / "file", *QUICK, "--scheduler", file)
-        assert done.code == 0, done.err
+        compared = ("evaluate", "virtual:ball?frames=4&size=64x48", "--every", "2", *QUICK, "--json")
+        for name, where in (("local", ("--jobs", "1")), ("spread", ("--scheduler", str(file)))):
+            subprocess.run([*START, *compared, str(tmp_path / name), *where], check=True, **quiet)
+        assert (tmp_path / "local").read_text() == (tmp_path / "spread").read_text()
     finally:
         for process in started:
             process.kill()
