@@ -69,7 +69,7 @@ def test_engine_costs_little_and_a_second_worker_brings_much(
 def test_time_and_memory_grow_linearly(tmp_path: Path) -> None:
     """Folders of 5 frames of 64x48; the client's peak is that of its process, as the system counts it."""
     write(tmp_path / "one", "ball", 5, 1)
-    sizes, took_s, peaks_mb = (500, 1000, 2000, 4000), [], []
+    sizes, took_s, peaks_mb = (1000, 3000, 6000), [], []
     for size in sizes:
         archive = tmp_path / f"archive{size}"
         for number in range(size):
