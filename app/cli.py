@@ -190,7 +190,7 @@ def export(paths: Annotated[tuple[str, ...], optional("SOURCE... OUT")], /, fram
     "Files",
     (f"{PROGRAM} batch archive/ --out results", "every recording in it: a table each, and a summary"),
     (f"{PROGRAM} batch 'day1/*.oni' scans/ --out results --budget 5% --models", "and what a budget buys"),
-    (f"{PROGRAM} batch - --out results < list.txt", "a list of recordings"),
+    (f"{PROGRAM} batch - --out results", "a list of recordings on standard input"),
     (f"{PROGRAM} batch archive/ --out results --scheduler tcp://host:8786", "on a Dask cluster"),
 )
 def batch(

@@ -35,8 +35,8 @@ _NEXT: Final = "depth frames are 16-bit grey PNG; convert this file or remove it
 def is_depth_png(path: Path) -> bool:
     """Whether an image is no picture for people: no PNG file of 8 bits or in colour."""
     with path.open("rb") as file:
-        header = file.read(HEADER_BYTES)
-    return not header.startswith(SIGNATURE) or header[24:26] == b"\x10\x00"
+        header = file.read(26)
+    return not header.startswith(b"\x89PNG") or header[24:26] == b"\x10\x00"
 
 
 def read_raw(path: Path) -> npt.NDArray[Any]:
