@@ -55,7 +55,8 @@ def engine(scheduler: str | None = None, workers: int | None = None) -> Iterator
         raise AppError("this needs Dask, which is not installed: pip install 'selective-depth[batch]'.")
     import dask
 
-    os.environ["DASK_LOGGING__DISTRIBUTED"] = "critical"  # of the workers; what matters comes as a result
+    # Of the workers, which read it when they import Dask; what matters of it comes as a result.
+    os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")
     with dask.config.set(_QUIET):
         if scheduler is not None:
             with _there(scheduler) as client:
@@ -63,7 +64,6 @@ def engine(scheduler: str | None = None, workers: int | None = None) -> Iterator
             return
         from distributed import Client, LocalCluster
 
-        os.environ["SELECTIVE_DEPTH_THREADS"] = "1"  # of the workers, which inherit it
         with interrupt.started_deaf(), waiting("Starting the workers"):
             cluster = LocalCluster(
                 n_workers=workers or default_threads(),
@@ -71,6 +71,7 @@ def engine(scheduler: str | None = None, workers: int | None = None) -> Iterator
                 processes=True,
                 host="127.0.0.1",
                 dashboard_address="127.0.0.1:0",
+                env={"SELECTIVE_DEPTH_THREADS": "1"},
             )
             client = Client(cluster)
         done = False
