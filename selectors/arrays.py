@@ -12,6 +12,14 @@ import warnings
 import numpy as np
 import numpy.typing as npt
 
+Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int32]
+Longs = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+Bytes = npt.NDArray[np.uint8]
+"""Arrays by what they hold: depths and scores, exact sums, pixels, places, masks, counts."""
+
 FARTHEST_MM = 1e7
 """10 km: no depth sensor sees farther, and its square and its variance are good in 32 bits."""
 
@@ -19,7 +27,7 @@ _METRES = 100.0
 """Depths in floats that are all below this many millimetres are likely to be metres."""
 
 
-def measured_mm(depth: npt.ArrayLike, name: str = "depth_mm") -> npt.NDArray[np.float32]:
+def measured_mm(depth: npt.ArrayLike, name: str = "depth_mm") -> Floats:
     """Depth in millimetres, whole in memory, 0 where there is no measurement; always a copy.
 
     Parameters
@@ -47,7 +55,7 @@ def measured_mm(depth: npt.ArrayLike, name: str = "depth_mm") -> npt.NDArray[np.
     return mm
 
 
-def warn_of_metres(given: npt.ArrayLike, mm: npt.NDArray[np.float32], name: str) -> None:
+def warn_of_metres(given: npt.ArrayLike, mm: Floats, name: str) -> None:
     """Say it if depths look like metres: in floats, and none as far as 10 cm."""
     farthest = float(mm.max(initial=0))
     if np.ma.getdata(given).dtype.kind == "f" and 0 < farthest < _METRES:
@@ -56,7 +64,7 @@ def warn_of_metres(given: npt.ArrayLike, mm: npt.NDArray[np.float32], name: str)
         )
 
 
-def pixels_in(uv: npt.ArrayLike, shape: tuple[int, int], name: str = "uv") -> npt.NDArray[np.int32]:
+def pixels_in(uv: npt.ArrayLike, shape: tuple[int, int], name: str = "uv") -> Ints:
     """Pixels of a frame, column first: int32 of shape (n, 2), whole in memory.
 
     Raises
@@ -83,9 +91,7 @@ def pixels_in(uv: npt.ArrayLike, shape: tuple[int, int], name: str = "uv") -> np
     return np.ascontiguousarray(given, np.int32)
 
 
-def sample_pairs(
-    uv: npt.ArrayLike, depth_mm: npt.ArrayLike, shape: tuple[int, int]
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+def sample_pairs(uv: npt.ArrayLike, depth_mm: npt.ArrayLike, shape: tuple[int, int]) -> tuple[Ints, Floats]:
     """Pixels and their depths, checked and of one length; see `pixels_in` and `measured_mm`."""
     pixels, mm = pixels_in(uv, shape), measured_mm(depth_mm)
     if mm.shape != (len(pixels),):
@@ -96,7 +102,7 @@ def sample_pairs(
     return pixels, mm
 
 
-def checked_map(values: npt.ArrayLike, shape: tuple[int, int], name: str) -> npt.NDArray[np.float32]:
+def checked_map(values: npt.ArrayLike, shape: tuple[int, int], name: str) -> Floats:
     """A worth for every pixel of a frame, float32, 0 where it is masked, negative or no number.
 
     Raises

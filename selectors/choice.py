@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
-from selective_depth.selectors.arrays import checked_map
+from selective_depth.selectors.arrays import Floats, Ints, Longs, checked_map
 from selective_depth.selectors.parallel import in_bands
 
 CROWDED = 0.3
@@ -22,15 +22,7 @@ _SAMPLED = 31  # shares no factor with the usual widths of images
 
 
 @njit(cache=True, nogil=True)
-def _gather(
-    score: npt.NDArray[np.float32],
-    least: float,
-    crowded: float,
-    pixel: npt.NDArray[np.int64],
-    worth: npt.NDArray[np.float32],
-    first: int,
-    end: int,
-) -> int:
+def _gather(score: Floats, least: float, crowded: float, pixel: Longs, worth: Floats, first: int, end: int) -> int:
     """Pixels of the rows first..end worth at least `least`, written from first's place on."""
     height, width = score.shape
     at = first * width
@@ -53,9 +45,7 @@ def _gather(
     return count
 
 
-def _best(
-    score: npt.NDArray[np.float32], shots: int, least: float, crowded: float, threads: int | None
-) -> npt.NDArray[np.int32]:
+def _best(score: Floats, shots: int, least: float, crowded: float, threads: int | None) -> Ints:
     """The pixels worth most, and `least` at the least, row by row of the image."""
     width = score.shape[1]
     pixel, worth = np.empty(score.size, np.int64), np.empty(score.size, np.float32)
@@ -81,9 +71,7 @@ def _best(
     return np.stack((pixel % width, pixel // width), axis=-1).astype(np.int32)
 
 
-def choose(
-    score: npt.ArrayLike, shots: int, *, crowded: float = CROWDED, threads: int | None = None
-) -> npt.NDArray[np.int32]:
+def choose(score: npt.ArrayLike, shots: int, *, crowded: float = CROWDED, threads: int | None = None) -> Ints:
     """The pixels of a map that are worth most.
 
     Parameters

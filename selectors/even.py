@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
+from selective_depth.selectors.arrays import Bools, Floats, Ints
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid, cell_centres
 from selective_depth.selectors.selection import Selection
@@ -15,7 +15,7 @@ _BITS = 10
 """The order of filling repeats after 2**10 pixels."""
 
 
-def even_lattice(shape: tuple[int, int], pixels: float) -> npt.NDArray[np.int32]:
+def even_lattice(shape: tuple[int, int], pixels: float) -> Ints:
     """A lattice of square pitch over a frame.
 
     Parameters
@@ -38,7 +38,7 @@ def even_lattice(shape: tuple[int, int], pixels: float) -> npt.NDArray[np.int32]
 
 
 @lru_cache(maxsize=4)
-def even_rank(shape: tuple[int, int]) -> npt.NDArray[np.float32]:
+def even_rank(shape: tuple[int, int]) -> Floats:
     """Rank of every pixel, 0 <= rank < 1, such that the first n of any region fill it evenly.
 
     The ordered dither of halftone printing; read-only.
@@ -53,7 +53,7 @@ def even_rank(shape: tuple[int, int]) -> npt.NDArray[np.float32]:
     return even
 
 
-def spread(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
+def spread(mask: Bools) -> Floats:
     """Worth of pixels such that shots fill a mask evenly, and only then what is outside of it."""
     return np.where(mask, np.float32(2), np.float32(1)) - even_rank(mask.shape)
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.selectors.arrays import sample_pairs
+from selective_depth.selectors.arrays import Floats, sample_pairs
 from selective_depth.selectors.triangulation import Surface
 
 
 def reconstruct(
     uv: npt.ArrayLike, depth_mm: npt.ArrayLike, shape: tuple[int, int], *, threads: int | None = None
-) -> npt.NDArray[np.float32]:
+) -> Floats:
     """Dense depth from samples: linear on Delaunay triangles, without bridging depth steps.
 
     Parameters

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from selective_depth.drivers.frame import Camera
 from selective_depth.drivers.kernels import njit
-from selective_depth.selectors.arrays import sample_pairs
+from selective_depth.selectors.arrays import Bools, Floats, Ints, sample_pairs
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.triangulation import FAR_SQ, nearest_sample
 
@@ -25,12 +25,7 @@ _WORD = 64
 
 
 @njit(cache=True, nogil=True)
-def _record(
-    uv: npt.NDArray[np.int32],
-    depth_mm: npt.NDArray[np.float32],
-    image_mm: npt.NDArray[np.float32],
-    bits: npt.NDArray[np.uint64],
-) -> None:
+def _record(uv: Ints, depth_mm: Floats, image_mm: Floats, bits: npt.NDArray[np.uint64]) -> None:
     for i in range(len(uv)):
         u, v = uv[i, 0], uv[i, 1]
         bits[v, (u >> 6) + 1] |= np.uint64(1) << np.uint64(u & 63)
@@ -84,7 +79,7 @@ class Samples:
         self.bits = np.zeros((height, (width + _WORD - 1) // _WORD + 2), np.uint64)
         self.additions = 0
         self.nearest_mm = math.inf
-        self._added: list[tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]] = []
+        self._added: list[tuple[Ints, Floats]] = []
 
     @classmethod
     def of(cls, seeds: SeedGrid | Samples, pitch_px: float | None = None) -> Samples:
@@ -120,7 +115,7 @@ class Samples:
         self._added.append((pixels, mm))
         _record(pixels, mm, self.image_mm, self.bits)
 
-    def added_since(self, addition: int) -> Iterator[tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]]:
+    def added_since(self, addition: int) -> Iterator[tuple[Ints, Floats]]:
         """Pixels and depths (0 = no return) of every addition after one of that number."""
         return iter(self._added[addition:])
 
@@ -139,27 +134,27 @@ class Samples:
         return self.seeds.camera
 
     @property
-    def uv(self) -> npt.NDArray[np.int32]:
+    def uv(self) -> Ints:
         """Pixels (column, row) of the samples that returned depth, shape (n, 2), row by row."""
         return np.argwhere(self.image_mm > 0)[:, ::-1].astype(np.int32)
 
     @property
-    def depth_mm(self) -> npt.NDArray[np.float32]:
+    def depth_mm(self) -> Floats:
         """Their depths, shape (n,)."""
         return self.image_mm[self.image_mm > 0]
 
     @property
-    def points_mm(self) -> npt.NDArray[np.float32]:
+    def points_mm(self) -> Floats:
         """Their metric points, shape (n, 3)."""
         return self.seeds.points_at(self.uv, self.depth_mm)
 
-    def gap_px(self) -> npt.NDArray[np.float32]:
+    def gap_px(self) -> Floats:
         """Distance of every pixel to the nearest return, (H, W); infinite if there is none."""
         _, gap_sq = nearest_sample(self.image_mm > 0)
         gap = np.sqrt(gap_sq, dtype=np.float32)
         gap[gap_sq == FAR_SQ] = np.inf
         return gap
 
-    def open(self) -> npt.NDArray[np.bool_]:
+    def open(self) -> Bools:
         """Pixels that may be shot, (H, W): not measured yet, and within reach of a return."""
         return np.asarray((self.image_mm == 0) & (self.gap_px() <= self.reach_px))

@@ -11,13 +11,13 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.selectors.arrays import measured_mm, warn_of_metres
+from selective_depth.selectors.arrays import Bools, Floats, Ints, measured_mm, warn_of_metres
 
-Measure = Callable[[npt.NDArray[np.int32]], npt.ArrayLike]
+Measure = Callable[[Ints], npt.ArrayLike]
 """A random-access depth sensor: pixels (n, 2), column first, to depth (n,) in mm, 0 = none."""
 
 
-def cell_centres(pixels: int, cells: int, name: str = "seeds") -> npt.NDArray[np.int32]:
+def cell_centres(pixels: int, cells: int, name: str = "seeds") -> Ints:
     """Pixel at the centre of each of `cells` equal cells along an axis of `pixels` pixels.
 
     ``floor((i + 0.5) * pixels / cells)``, in integers so that no rounding moves a seed. If they do
@@ -48,12 +48,12 @@ class SeedGrid:
         Metric points of a sensor without pinhole camera (x right, y down, z forward).
     """
 
-    columns: npt.NDArray[np.int32]
-    rows: npt.NDArray[np.int32]
-    depth_mm: npt.NDArray[np.float32]
+    columns: Ints
+    rows: Ints
+    depth_mm: Floats
     frame_shape: tuple[int, int]
     camera: Camera | None
-    given_points_mm: npt.NDArray[np.float32] | None = None
+    given_points_mm: Floats | None = None
 
     @classmethod
     def from_frame(cls, frame: DepthFrame, shape: tuple[int, int] = (128, 128)) -> SeedGrid:
@@ -166,34 +166,34 @@ class SeedGrid:
         return len(self.rows), len(self.columns)
 
     @cached_property
-    def valid(self) -> npt.NDArray[np.bool_]:
+    def valid(self) -> Bools:
         """Which seeds returned depth, shape (R, C)."""
         return self.depth_mm > 0
 
     @cached_property
-    def lattice_uv(self) -> npt.NDArray[np.int32]:
+    def lattice_uv(self) -> Ints:
         """Pixel (column, row) of every seed, shape (R, C, 2)."""
         u, v = np.meshgrid(self.columns, self.rows)
         return np.stack((u, v), axis=-1)
 
     @cached_property
-    def lattice_points_mm(self) -> npt.NDArray[np.float32]:
+    def lattice_points_mm(self) -> Floats:
         """Metric point of every seed, shape (R, C, 3), NaN where missing."""
         if self.given_points_mm is not None:
             return self.given_points_mm
         return self.points_at(self.lattice_uv, self.depth_mm)
 
     @cached_property
-    def uv(self) -> npt.NDArray[np.int32]:
+    def uv(self) -> Ints:
         """Pixels (column, row) of the seeds that returned depth, shape (n, 2), row by row."""
         return self.lattice_uv[self.valid]
 
     @cached_property
-    def points_mm(self) -> npt.NDArray[np.float32]:
+    def points_mm(self) -> Floats:
         """Metric points of the seeds that returned depth, shape (n, 3), row by row."""
         return np.ascontiguousarray(self.lattice_points_mm[self.valid])
 
-    def points_at(self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def points_at(self, uv: Ints, depth_mm: Floats) -> Floats:
         """Metric points of pixels (..., 2) of the frame with these depths, shape (..., 3).
 
         Without a camera, the rays between the seeds' own are interpolated.
@@ -220,7 +220,7 @@ class SeedGrid:
         return np.asarray(ray * depth_mm[..., None], np.float32)
 
 
-def answers(measure: Measure, uv: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.generic], npt.NDArray[np.float32]]:
+def answers(measure: Measure, uv: Ints) -> tuple[npt.NDArray[np.generic], Floats]:
     """Ask a sensor for pixels (n, 2): its own answer, and depth (n,) in mm, 0 = no return.
 
     Raises

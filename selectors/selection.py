@@ -25,7 +25,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.selectors.arrays import checked_map
+from selective_depth.selectors.arrays import Bools, Floats, Ints, checked_map
 from selective_depth.selectors.choice import CROWDED, choose
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
@@ -52,8 +52,8 @@ class Selection:
         worth spreads them by itself.
     """
 
-    mask: npt.NDArray[np.bool_]
-    score: npt.NDArray[np.float32]
+    mask: Bools
+    score: Floats
     name: str
     crowded: float = field(default=CROWDED, kw_only=True)
 
@@ -66,12 +66,12 @@ class Selection:
             )
 
     @property
-    def worth(self) -> npt.NDArray[np.float32]:
+    def worth(self) -> Floats:
         """What shots are chosen by, float32 (height, width): the score, where nothing else."""
         return self.score
 
     @classmethod
-    def of_score(cls, score: npt.NDArray[np.float32], name: str) -> Selection:
+    def of_score(cls, score: Floats, name: str) -> Selection:
         """The selection of a plain score: its mask is the best `BEST_SHARE` of the pixels."""
         wanted = max(round(BEST_SHARE * score.size), 1)
         least = np.partition(score, score.size - wanted, axis=None)[score.size - wanted]
@@ -90,7 +90,7 @@ class Selector(Protocol):
 class Plan(Protocol):
     """An acquisition under way: says, round after round, which pixels to measure next."""
 
-    def best(self, shots: int) -> npt.NDArray[np.int32]:
+    def best(self, shots: int) -> Ints:
         """At most so many pixels, shape (n, 2), column first, from the samples as they are."""
         ...
 
@@ -146,7 +146,7 @@ class _Plainly:
     samples: Samples
     threads: int | None
 
-    def best(self, shots: int) -> npt.NDArray[np.int32]:
+    def best(self, shots: int) -> Ints:
         selection = self.selector.select(self.samples)
         worth = checked_map(selection.worth, self.samples.frame_shape, "the worth of a selection")
         worth[~self.samples.open()] = 0

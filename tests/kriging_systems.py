@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.selectors.improvement.neighbourhoods import Axis, IntArray, windows_of
+from selective_depth.selectors.arrays import Longs
+from selective_depth.selectors.improvement.neighbourhoods import Axis, windows_of
 from selective_depth.selectors.improvement.scattered import EXPONENT
 from selective_depth.selectors.improvement.variogram import fit_samples
 from selective_depth.selectors.seeds import SeedGrid
@@ -67,7 +68,7 @@ def local_systems(seeds: SeedGrid, u: int, v: int, exponent: float = EXPONENT) -
     height, width = seeds.frame_shape
     neighbours = np.array((u, v)) + NEIGHBOURS
     inside = (neighbours >= 0).all(axis=1) & (neighbours < (width, height)).all(axis=1)
-    found: list[tuple[float, float, float, IntArray, npt.NDArray[np.float64]]] = []
+    found: list[tuple[float, float, float, Longs, npt.NDArray[np.float64]]] = []
     for i, share_down in _centres(windows.rows, v):
         for j, share_across in _centres(windows.columns, u):
             box = np.s_[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]

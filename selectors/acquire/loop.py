@@ -10,7 +10,7 @@ import numpy.typing as npt
 from selective_depth.selectors.acquire.refinement import finer_lattice
 from selective_depth.selectors.acquire.step import StepSelector
 from selective_depth.selectors.acquire.surface import SurfacePlan, SurfaceSelector
-from selective_depth.selectors.arrays import pixels_in
+from selective_depth.selectors.arrays import Bools, Bytes, Floats, Ints, pixels_in
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import Measure, SeedGrid, answers
@@ -59,27 +59,27 @@ class Acquisition:
         What chose the shots, where that has made the model on its way.
     """
 
-    uv: npt.NDArray[np.int32]
-    depth_mm: npt.NDArray[np.uint16] | npt.NDArray[np.float32]
-    round: npt.NDArray[np.uint8]
+    uv: Ints
+    depth_mm: npt.NDArray[np.uint16] | Floats
+    round: Bytes
     frame_shape: tuple[int, int]
     rounds: tuple[Round, ...]
     by: str = ""
     plan: SurfacePlan | None = None
 
     @property
-    def returned(self) -> npt.NDArray[np.bool_]:
+    def returned(self) -> Bools:
         """Which measurements returned depth, shape (n,)."""
         return self.depth_mm > 0
 
-    def mask(self, number: int | None = None) -> npt.NDArray[np.bool_]:
+    def mask(self, number: int | None = None) -> Bools:
         """Pixels shot in a round (0 = the seeds), or in all rounds after the seeds."""
         chosen = self.round > 0 if number is None else self.round == number
         mask = np.zeros(self.frame_shape, np.bool_)
         mask[self.uv[chosen, 1], self.uv[chosen, 0]] = True
         return mask
 
-    def reconstruct(self, threads: int | None = None) -> npt.NDArray[np.float32]:
+    def reconstruct(self, threads: int | None = None) -> Floats:
         """Dense depth of the model in millimetres, shape (H, W)."""
         if self.plan is not None:
             return self.plan.model_mm()
@@ -112,7 +112,7 @@ def _shares(shots: int, rounds: int, first: int) -> list[int]:
     return given + [first + (shots - first) * (n + 1) // count for n in range(count)]
 
 
-def _fits_16_bits(depth_mm: npt.NDArray[np.float32]) -> bool:
+def _fits_16_bits(depth_mm: Floats) -> bool:
     return bool(depth_mm.max(initial=0) <= np.iinfo(np.uint16).max)
 
 
@@ -195,7 +195,7 @@ def acquire(
         uv.append(new_uv)
         depth.append(new_mm)
         made.append(Round(len(new_uv), int(np.count_nonzero(new_mm))))
-    depth_mm: npt.NDArray[np.float32] = np.concatenate(depth)
+    depth_mm: Floats = np.concatenate(depth)
     return Acquisition(
         np.concatenate(uv),
         depth_mm.astype(np.uint16) if whole else depth_mm,
@@ -207,7 +207,7 @@ def acquire(
     )
 
 
-def _allowed(uv: npt.ArrayLike, samples: Samples, left: int) -> npt.NDArray[np.int32]:
+def _allowed(uv: npt.ArrayLike, samples: Samples, left: int) -> Ints:
     """What a plan asks for, if it may: pixels of the frame, each for the first time, no more."""
     pixels = pixels_in(uv, samples.frame_shape, "the plan's pixels")
     places = pixels[:, 1].astype(np.int64) * samples.frame_shape[1] + pixels[:, 0]
@@ -221,7 +221,7 @@ def _allowed(uv: npt.ArrayLike, samples: Samples, left: int) -> npt.NDArray[np.i
     return pixels
 
 
-def _refuse_metres(new_mm: npt.NDArray[np.float32], samples: Samples) -> None:
+def _refuse_metres(new_mm: Floats, samples: Samples) -> None:
     """A sensor that answers a hundredth of all that was measured so far means something else."""
     farthest, nearest = float(new_mm.max(initial=0)), samples.nearest_mm
     if 0 < farthest < nearest / 100 < np.inf:

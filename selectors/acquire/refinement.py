@@ -7,9 +7,9 @@ seeds finds it, but every other sample in the middle of four does, for a small p
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from selective_depth.selectors.arrays import Ints, Longs
 from selective_depth.selectors.samples import seed_pitch_px
 from selective_depth.selectors.seeds import SeedGrid
 
@@ -33,7 +33,7 @@ steps, 95.6 % at 2 and 3, 95.1 % without an end), but from a frame of `sequence`
 missed a thing of 32x5 pixels at 1.3 steps."""
 
 
-def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[npt.NDArray[np.int32], float]:
+def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[Ints, float]:
     """Pixels between the seeds that make their lattice finer, if it is coarse and they are few.
 
     Each step adds the middles of the squares of neighbours, which shortens the pitch by sqrt(2):
@@ -57,7 +57,7 @@ def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[npt.NDArray[np.int32], f
     rows, columns = seeds.rows.astype(np.int64), seeds.columns.astype(np.int64)
     pitch_px = seed_pitch_px(seeds)
     reach_px = HOLE_STEPS * pitch_px
-    added: list[npt.NDArray[np.int64]] = []
+    added: list[Longs] = []
     spent = 0
     centred = False  # whether the middles of the cells are in
     height, width = seeds.frame_shape
@@ -85,7 +85,7 @@ def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[npt.NDArray[np.int32], f
     return uv[distance_px <= reach_px].astype(np.int32), pitch_px
 
 
-def _middles(at: npt.NDArray[np.int64], pixels: int) -> npt.NDArray[np.int64]:
+def _middles(at: Longs, pixels: int) -> Longs:
     """Between each place and the next; after the last one as well; where there are pixels."""
     middles = (at[:-1] + at[1:]) // 2
     middles = middles[middles > at[:-1]]
@@ -93,5 +93,5 @@ def _middles(at: npt.NDArray[np.int64], pixels: int) -> npt.NDArray[np.int64]:
     return np.append(middles, last) if last > at[-1] else middles
 
 
-def _grid(rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+def _grid(rows: Longs, columns: Longs) -> Longs:
     return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)

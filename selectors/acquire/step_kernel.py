@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Floats
 
-Image = npt.NDArray[np.float32]
+Image = Floats
 
 # Position of the lowest set bit of a word: multiplied by a de Bruijn sequence, each single bit
 # leaves another number in the top six bits.

@@ -14,9 +14,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Bools, Floats, Ints, Longs
 from selective_depth.selectors.choice import choose
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import Samples
@@ -24,20 +24,12 @@ from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.selection import Selection
 from selective_depth.selectors.triangulation import FAR_SQ, TILE_PX, Layers, Surface
 
-Float32Array = npt.NDArray[np.float32]
-
 _FLAT = np.float32(1e-3)
 """Slope where the model has none, mm per pixel: what is left of a budget spreads by it."""
 
 
 @njit(cache=True, nogil=True)
-def _note_misses(
-    uv: npt.NDArray[np.int32],
-    depth_mm: Float32Array,
-    radius: int,
-    miss_sq: npt.NDArray[np.int32],
-    touched: npt.NDArray[np.bool_],
-) -> None:
+def _note_misses(uv: Ints, depth_mm: Floats, radius: int, miss_sq: Ints, touched: Bools) -> None:
     """Lower the squared distance to the nearest miss within a radius of each, and book it."""
     height, width = miss_sq.shape
     for i in range(len(uv)):
@@ -54,13 +46,7 @@ def _note_misses(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _score_tiles(
-    tiles: npt.NDArray[np.int64],
-    layers: Layers,
-    image_mm: Float32Array,
-    miss_sq: npt.NDArray[np.int32],
-    reach_sq: float,
-    noise_mm2: float,
-    score: Float32Array,
+    tiles: Longs, layers: Layers, image_mm: Floats, miss_sq: Ints, reach_sq: float, noise_mm2: float, score: Floats
 ) -> None:
     """Score the pixels of some tiles, numbered row by row; `image_mm` is that of the samples."""
     height, width = score.shape
@@ -161,12 +147,12 @@ class SurfacePlan:
 
         in_bands(band, len(tiles), self._rule.threads)
 
-    def best(self, shots: int) -> npt.NDArray[np.int32]:
+    def best(self, shots: int) -> Ints:
         """The `shots` pixels that are worth most, from the samples as they are now."""
         self.look()
         return choose(self.score, shots, threads=self._rule.threads)
 
-    def model_mm(self) -> Float32Array:
+    def model_mm(self) -> Floats:
         """Dense depth of the samples as they are now, float32 (height, width); a copy."""
         for uv, depth_mm in self._samples.added_since(self._seen):
             self._surface.add(uv, depth_mm)

@@ -7,9 +7,9 @@ windows side by side; each inner loop runs over lanes and becomes vector instruc
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Floats
 from selective_depth.selectors.improvement.lattice_tables import CONTRASTS, SEEDS
 from selective_depth.selectors.improvement.systems import aligned_zeros
 
@@ -30,7 +30,7 @@ _AROUND = _FLOOR + LANES  # what a pixel's neighbours add to its improvement
 _ROWS_END = _AROUND + LANES
 
 
-def lattice_scratch(most_pixels: int) -> tuple[npt.NDArray[np.float32], ...]:
+def lattice_scratch(most_pixels: int) -> tuple[Floats, ...]:
     """Working memory of `krige_lanes` for windows of up to `most_pixels`; one per thread."""
     return (
         aligned_zeros(_ROWS_END),

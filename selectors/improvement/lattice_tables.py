@@ -29,10 +29,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.selectors.arrays import Bools, Doubles, Floats, Longs
 from selective_depth.selectors.improvement.systems import aligned_empty, padded_pixels
-
-FloatArray = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
 
 SEEDS = 9
 """Seeds in a window without holes."""
@@ -74,18 +72,18 @@ class LatticeTables:
         Sums over the pairs of seeds of h^w and h^2w.
     """
 
-    first_pixel: IntArray
-    first_pair: IntArray
-    distances: FloatArray
-    between: npt.NDArray[np.float64]
-    vectors: FloatArray
-    is_seed: npt.NDArray[np.bool_]
-    products: FloatArray
-    bases: FloatArray
-    basis: FloatArray
-    eigenvalues: FloatArray
-    distance_sums: FloatArray
-    moments: FloatArray
+    first_pixel: Longs
+    first_pair: Longs
+    distances: Floats
+    between: Doubles
+    vectors: Floats
+    is_seed: Bools
+    products: Floats
+    bases: Floats
+    basis: Floats
+    eigenvalues: Floats
+    distance_sums: Floats
+    moments: Floats
 
     def arrays(self) -> tuple[npt.NDArray[np.generic], ...]:
         """Everything, in order, as the kernels take it."""
@@ -115,13 +113,13 @@ def build_tables(geometries: list[tuple[int, int, int, int]], exponent: float) -
     pixels = [len(part["is_seed"]) for part in parts]
     pairs = [len(part["bases"]) for part in parts]
 
-    def joined(name: str, axis: int = 0) -> FloatArray:
+    def joined(name: str, axis: int = 0) -> Floats:
         whole = np.concatenate([part[name] for part in parts], axis=axis)
         kept = aligned_empty(*whole.shape)
         kept[...] = whole
         return kept
 
-    def stacked(name: str) -> FloatArray:
+    def stacked(name: str) -> Floats:
         return np.ascontiguousarray(np.stack([part[name] for part in parts]), np.float32)
 
     return LatticeTables(

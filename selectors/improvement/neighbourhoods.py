@@ -17,13 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.selectors.arrays import Doubles, Floats, Longs
 from selective_depth.selectors.improvement.lattice import LANES
 from selective_depth.selectors.improvement.lattice_tables import LatticeTables, build_tables
 from selective_depth.selectors.improvement.systems import MAX_PIXELS, padded_pixels
 from selective_depth.selectors.improvement.variogram import power_table
 from selective_depth.selectors.seeds import SeedGrid, cell_centres
-
-IntArray = npt.NDArray[np.int64]
 
 REACH = 1.3
 """Pixels farther than this many times the (wider) pitch from every sample are unknown.
@@ -56,18 +55,18 @@ class Axis:
     """
 
     pixels: int
-    centres: IntArray
-    before: IntArray
-    after: IntArray
-    first: IntArray
-    second: IntArray
-    first_at: IntArray
-    second_at: IntArray
-    first_weight: npt.NDArray[np.float32]
-    second_weight: npt.NDArray[np.float32]
+    centres: Longs
+    before: Longs
+    after: Longs
+    first: Longs
+    second: Longs
+    first_at: Longs
+    second_at: Longs
+    first_weight: Floats
+    second_weight: Floats
 
     @cached_property
-    def shapes(self) -> tuple[IntArray, IntArray]:
+    def shapes(self) -> tuple[Longs, Longs]:
         """The different (before, after), shape (k, 2), and which of them each window has."""
         pairs = np.stack((self.before, self.after), axis=1)
         different, which = np.unique(pairs, axis=0, return_inverse=True)
@@ -137,7 +136,7 @@ class Windows:
     rows: Axis
     columns: Axis
     reach_px: float
-    power: npt.NDArray[np.float64]
+    power: Doubles
     exponent: float
 
     @cached_property
@@ -153,7 +152,7 @@ class Windows:
         )
 
     @cached_property
-    def order(self) -> tuple[IntArray, IntArray, IntArray]:
+    def order(self) -> tuple[Longs, Longs, Longs]:
         """How the windows of a lattice row are laid side by side.
 
         Returns
@@ -167,7 +166,7 @@ class Windows:
             Where each lattice column went: batch * LANES + lane.
         """
         which = self.columns.shapes[1]
-        batches: list[IntArray] = []
+        batches: list[Longs] = []
         shape_of = []
         place = np.zeros(len(which), np.int64)
         for shape in range(len(self.columns.shapes[0])):

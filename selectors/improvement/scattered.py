@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
-from selective_depth.selectors.arrays import checked_map, sample_pairs
+from selective_depth.selectors.arrays import Bools, Floats, Longs, checked_map, sample_pairs
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_over
 from selective_depth.selectors.improvement.systems import MAX_SAMPLES, Box, krige_window, sample_buffers, window_scratch
 from selective_depth.selectors.improvement.variogram import fit_samples
@@ -43,10 +43,10 @@ class ImprovementMap:
         Improvement (eq. 23) in millimetres, 0 where unknown or not asked for.
     """
 
-    estimate_mm: npt.NDArray[np.float32]
-    variance_mm2: npt.NDArray[np.float32]
-    known: npt.NDArray[np.bool_]
-    raw: npt.NDArray[np.float32]
+    estimate_mm: Floats
+    variance_mm2: Floats
+    known: Bools
+    raw: Floats
 
 
 def improvement_scattered(
@@ -114,19 +114,14 @@ class _Work(NamedTuple):
     """
 
     samples: tuple[npt.NDArray[Any], ...]
-    distances: npt.NDArray[np.float32]
+    distances: Floats
     scratch: tuple[npt.NDArray[Any], ...]
-    sums: npt.NDArray[np.float32]
-    held: npt.NDArray[np.float32]
+    sums: Floats
+    held: Floats
 
 
 def map_scattered(
-    measured: npt.NDArray[np.float32],
-    asked: npt.NDArray[np.bool_] | None,
-    windows: Windows,
-    threads: int | None,
-    *,
-    by_sums: bool = False,
+    measured: Floats, asked: Bools | None, windows: Windows, threads: int | None, *, by_sums: bool = False
 ) -> ImprovementMap:
     """Map the improvement of an image of samples (mm, 0 = none) at the pixels asked for, or all."""
     asked = np.ones(measured.shape, np.bool_) if asked is None else asked
@@ -159,7 +154,7 @@ def map_scattered(
     return result
 
 
-def _spiral(reach: int) -> npt.NDArray[np.int64]:
+def _spiral(reach: int) -> Longs:
     """Offsets (dv, du) up to `reach`, the nearest first; equals in a fixed order."""
     steps = np.arange(-reach, reach + 1)
     dv, du = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))

@@ -12,9 +12,9 @@ import threading
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import maximum_filter
 
+from selective_depth.selectors.arrays import Bools, Floats, Ints
 from selective_depth.selectors.choice import choose
 from selective_depth.selectors.improvement.lattice import lattice_scratch
 from selective_depth.selectors.improvement.map import LEVEL_SHIFT, LEVELS, best_threshold, improvement_rows
@@ -28,9 +28,6 @@ from selective_depth.selectors.selection import Selection
 
 HALF_SCORE = 5e-4
 """Improvement, as a share of the mean depth of the seeds, that scores one half."""
-
-FloatMap = npt.NDArray[np.float32]
-BoolMap = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +47,13 @@ class ImprovementSelection(Selection):
         0 at a seed and where unknown. `score` orders pixels exactly as `raw` does.
     """
 
-    estimate_mm: FloatMap
-    variance_mm2: FloatMap
-    known: BoolMap
-    raw: FloatMap
+    estimate_mm: Floats
+    variance_mm2: Floats
+    known: Bools
+    raw: Floats
 
     @property
-    def worth(self) -> FloatMap:
+    def worth(self) -> Floats:
         """What shots are chosen by: `raw`."""
         return self.raw
 
@@ -121,7 +118,7 @@ class ImprovementSelector:
         padded[1:-1, 1:-1] = seeds.depth_mm
         measured = np.count_nonzero(padded)
         half = np.float32(HALF_SCORE * padded.sum(dtype=np.float64) / measured if measured else 1.0)
-        histograms: list[npt.NDArray[np.int32]] = []
+        histograms: list[Ints] = []
 
         def band(first_row: int, end_row: int) -> None:
             histogram = np.zeros((2, LEVELS), np.int32)
@@ -148,7 +145,7 @@ class ImprovementSelector:
         """Begin an acquisition: after each round the map is made again where that changed it."""
         return ImprovementPlan(self, samples)
 
-    def _map(self, samples: Samples, asked: BoolMap | None = None) -> ImprovementMap:
+    def _map(self, samples: Samples, asked: Bools | None = None) -> ImprovementMap:
         windows = windows_of(samples.seeds, self.exponent)
         measured_mm = np.maximum(samples.image_mm, 0)
         return map_scattered(measured_mm, asked, windows, self.threads, by_sums=self.by_sums)
@@ -182,7 +179,7 @@ class ImprovementPlan:
         self._seen = 0
         self._raw = np.zeros(samples.frame_shape, np.float32)
 
-    def best(self, shots: int) -> npt.NDArray[np.int32]:
+    def best(self, shots: int) -> Ints:
         """The `shots` pixels whose measurement improves most, near some return."""
         samples, rule = self._samples, self._rule
         changed = np.zeros(samples.frame_shape, np.bool_)

@@ -44,6 +44,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Floats
 
 MAX_SAMPLES = 32
 """Most samples in one window; of more, the nearest to its centre count."""
@@ -75,7 +76,7 @@ def padded_pixels(width: int, height: int) -> int:
     return -(-room // VECTOR) * VECTOR
 
 
-def aligned_empty(*shape: int) -> npt.NDArray[np.float32]:
+def aligned_empty(*shape: int) -> Floats:
     """Memory that begins on a cache line: vectors that lie across two are slower to load."""
     count = math.prod(shape)
     room = np.empty(count + VECTOR, np.float32)
@@ -83,7 +84,7 @@ def aligned_empty(*shape: int) -> npt.NDArray[np.float32]:
     return room[start : start + count].reshape(shape)
 
 
-def aligned_zeros(*shape: int) -> npt.NDArray[np.float32]:
+def aligned_zeros(*shape: int) -> Floats:
     """`aligned_empty`, filled with zeros."""
     zeros = aligned_empty(*shape)
     zeros[...] = 0

@@ -16,12 +16,12 @@ h^-4) moved the best tenth of the map off the depth steps, see `app/docs/improve
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Doubles
 
 
-def power_table(exponent: float, reach: int) -> npt.NDArray[np.float64]:
+def power_table(exponent: float, reach: int) -> Doubles:
     """Distances between pixels, raised to the exponent of the semivariogram.
 
     Parameters
@@ -38,7 +38,7 @@ def power_table(exponent: float, reach: int) -> npt.NDArray[np.float64]:
         this is exact and no power is taken while a map is made.
     """
     steps = np.arange(-reach, reach + 1, dtype=np.float64)
-    squared: npt.NDArray[np.float64] = steps[:, None] ** 2 + steps[None, :] ** 2
+    squared: Doubles = steps[:, None] ** 2 + steps[None, :] ** 2
     return squared ** (exponent / 2)
 
 

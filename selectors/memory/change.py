@@ -8,9 +8,9 @@ found by more shots along the border between what contradicted and what did not.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Bools, Floats, Ints
 from selective_depth.selectors.memory.store import AGREE_MM, AGREE_SHARE
 from selective_depth.selectors.triangulation import nearest_sample
 
@@ -31,11 +31,8 @@ MOVED = 2.2
 scene. Of a still scene half are off by .9 to 1.4 (neighbours share a part of their error), with a
 ball and a person crossing by 1.7 at most, of a hand-held camera by 2.6 to 8.6."""
 
-Float32Array = npt.NDArray[np.float32]
-BoolArray = npt.NDArray[np.bool_]
 
-
-def contradicts(uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Float32Array) -> BoolArray:
+def contradicts(uv: Ints, depth_mm: Floats, model_mm: Floats) -> Bools:
     """Which measurements lie outside the range of the model about them, shape (n,).
 
     A miss contradicts nothing: much of what does not return does so now and then.
@@ -46,7 +43,7 @@ def contradicts(uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Flo
 
 
 @njit(cache=True, nogil=True)
-def _contradict(uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Float32Array, against: BoolArray) -> None:
+def _contradict(uv: Ints, depth_mm: Floats, model_mm: Floats, against: Bools) -> None:
     height, width = model_mm.shape
     for i in range(len(uv)):
         u, v, z = uv[i, 0], uv[i, 1], depth_mm[i]
@@ -61,7 +58,7 @@ def _contradict(uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Flo
         against[i] = z < low - tolerance or z > high + tolerance
 
 
-def drift(uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Float32Array, noise_mm: Float32Array) -> float:
+def drift(uv: Ints, depth_mm: Floats, model_mm: Floats, noise_mm: Floats) -> float:
     """How many standard errors the mean of a block's look-outs is off, median over the blocks.
 
     Parameters
@@ -88,12 +85,12 @@ def drift(uv: npt.NDArray[np.int32], depth_mm: Float32Array, model_mm: Float32Ar
     return float(np.median(np.abs(total[judged]) / np.sqrt(looks[judged]))) if judged.any() else 0.0
 
 
-def around(uv: npt.NDArray[np.int32], shape: tuple[int, int]) -> npt.NDArray[np.int32]:
+def around(uv: Ints, shape: tuple[int, int]) -> Ints:
     """The four pixels `NEAR_PX` beside each, those that lie inside the frame, each once."""
     offsets = NEAR_PX * np.array([(-1, 0), (1, 0), (0, -1), (0, 1)], np.int32)
     beside = (uv[:, None] + offsets).reshape(-1, 2)
     inside = ((beside >= 0) & (beside < (shape[1], shape[0]))).all(axis=1)
-    found: npt.NDArray[np.int32] = np.unique(beside[inside], axis=0)
+    found: Ints = np.unique(beside[inside], axis=0)
     return found
 
 
@@ -110,12 +107,12 @@ class Extent:
         self._looked = np.zeros(shape, np.bool_)
         self._against = np.zeros(shape, np.bool_)
 
-    def add(self, uv: npt.NDArray[np.int32], against: BoolArray) -> None:
+    def add(self, uv: Ints, against: Bools) -> None:
         """Take in looks, and which of them contradicted the memory."""
         self._looked[uv[:, 1], uv[:, 0]] = True
         self._against[uv[:, 1], uv[:, 0]] = against
 
-    def changed(self) -> tuple[BoolArray, Float32Array]:
+    def changed(self) -> tuple[Bools, Floats]:
         """Where the nearest look contradicted, and how far a border of it is from any look."""
         nearest, gap_sq = nearest_sample(self._looked)
         changed = self._against.ravel()[nearest]

@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Bools, Bytes, Floats, Ints
 
 KEPT = 31
 """Observations kept of a pixel."""
@@ -23,9 +23,6 @@ AGREE_MM, AGREE_SHARE = 30.0, 0.03
 to five times the noise of a Kinect."""
 
 NEVER = -(1 << 30)
-
-Float32Array = npt.NDArray[np.float32]
-ByteArray = npt.NDArray[np.uint8]
 
 
 class Memory(NamedTuple):
@@ -51,14 +48,14 @@ class Memory(NamedTuple):
         Number of the frame in which the pixel was measured last, whether it returned or not.
     """
 
-    ring_mm: Float32Array
-    place: ByteArray
-    held: ByteArray
-    missed: ByteArray
-    fused_mm: Float32Array
-    dissent: ByteArray
-    apart_mm2: Float32Array
-    asked: npt.NDArray[np.int32]
+    ring_mm: Floats
+    place: Bytes
+    held: Bytes
+    missed: Bytes
+    fused_mm: Floats
+    dissent: Bytes
+    apart_mm2: Floats
+    asked: Ints
 
     @classmethod
     def of(cls, shape: tuple[int, int]) -> Memory:
@@ -77,7 +74,7 @@ class Memory(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _fuse(values: Float32Array, before_mm: float) -> tuple[float, int, float]:
+def _fuse(values: Floats, before_mm: float) -> tuple[float, int, float]:
     """Mean of what agrees with the median, how many do not, and their mean squared distance.
 
     Of two middle values the one nearer to what was fused before is taken: their mean may lie
@@ -108,7 +105,7 @@ def _fuse(values: Float32Array, before_mm: float) -> tuple[float, int, float]:
 
 
 @njit(cache=True, nogil=True)
-def book(memory: Memory, uv: npt.NDArray[np.int32], depth_mm: Float32Array, now: int) -> None:
+def book(memory: Memory, uv: Ints, depth_mm: Floats, now: int) -> None:
     """Take in measurements of frame `now`: pixels (n, 2), column first, and depth, 0 = no return.
 
     A pixel that has missed three times, and more often than it had returned, is known no more.
@@ -137,7 +134,7 @@ def book(memory: Memory, uv: npt.NDArray[np.int32], depth_mm: Float32Array, now:
         memory.apart_mm2[v, u] = apart
 
 
-def forget(memory: Memory, where: npt.NDArray[np.bool_]) -> None:
+def forget(memory: Memory, where: Bools) -> None:
     """Know nothing of some pixels any more."""
     for layer in (memory.place, memory.held, memory.missed, memory.fused_mm, memory.dissent):
         layer[where] = 0

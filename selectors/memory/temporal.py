@@ -16,6 +16,7 @@ from scipy.ndimage import maximum_filter
 
 from selective_depth.drivers.frame import Camera
 from selective_depth.selectors.acquire import acquire, shots_of
+from selective_depth.selectors.arrays import Bools, Bytes, Floats, Ints
 from selective_depth.selectors.choice import choose
 from selective_depth.selectors.memory.change import MARGIN_PX, MOVED, NEAR_PX, Extent, around, contradicts, drift
 from selective_depth.selectors.memory.store import Memory, book, forget
@@ -76,15 +77,15 @@ class TemporalStep:
     """
 
     frame: int
-    uv: npt.NDArray[np.int32]
-    depth_mm: npt.NDArray[np.float32]
-    batch: npt.NDArray[np.uint8]
-    model_mm: npt.NDArray[np.float32]
-    known_mm: npt.NDArray[np.float32]
+    uv: Ints
+    depth_mm: Floats
+    batch: Bytes
+    model_mm: Floats
+    known_mm: Floats
     seeds: SeedGrid
-    known: npt.NDArray[np.bool_]
-    age_frames: npt.NDArray[np.int32]
-    changed: npt.NDArray[np.bool_]
+    known: Bools
+    age_frames: Ints
+    changed: Bools
     restarted: bool
     settled: bool
     by: str
@@ -96,10 +97,10 @@ class _Sensor:
     def __init__(self, measure: Measure, shape: tuple[int, int]) -> None:
         self._measure = measure
         self._answer_mm = np.full(shape, np.nan, np.float32)
-        self.uv: list[npt.NDArray[np.int32]] = []
-        self.depth_mm: list[npt.NDArray[np.float32]] = []
+        self.uv: list[Ints] = []
+        self.depth_mm: list[Floats] = []
 
-    def __call__(self, uv: npt.NDArray[np.integer]) -> npt.NDArray[np.float32]:
+    def __call__(self, uv: npt.NDArray[np.integer]) -> Floats:
         """Depth of pixels (n, 2), column first; 0 = no return."""
         u, v = uv[:, 0], uv[:, 1]
         new = np.isnan(self._answer_mm[v, u])
@@ -109,12 +110,12 @@ class _Sensor:
             self._answer_mm[asked[:, 1], asked[:, 0]] = mm
             self.uv.append(asked)
             self.depth_mm.append(mm)
-        found: npt.NDArray[np.float32] = self._answer_mm[v, u]
+        found: Floats = self._answer_mm[v, u]
         return found
 
-    def unasked(self, uv: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    def unasked(self, uv: Ints) -> Ints:
         """Those of some pixels that were not asked for yet."""
-        found: npt.NDArray[np.int32] = uv[np.isnan(self._answer_mm[uv[:, 1], uv[:, 0]])]
+        found: Ints = uv[np.isnan(self._answer_mm[uv[:, 1], uv[:, 0]])]
         return found
 
     @property
@@ -262,7 +263,7 @@ class TemporalAcquisition:
         at = np.ix_(self._grid.rows, self._grid.columns)
         return replace(self._grid, depth_mm=self._memory.fused_mm[at])
 
-    def _look_out(self, sensor: _Sensor, changed: npt.NDArray[np.bool_]) -> bool:
+    def _look_out(self, sensor: _Sensor, changed: Bools) -> bool:
         """Look whether all is as it was, and fill in where not; False if nothing is."""
         share = ALERT_LOOKS if self._alert else CALM_LOOKS
         count = min(round(share * self._shots), len(self._lattice_uv))
@@ -300,7 +301,7 @@ class TemporalAcquisition:
         changed[:] = maximum_filter(where, side)
         return True
 
-    def _start(self, sensor: _Sensor) -> npt.NDArray[np.float32]:
+    def _start(self, sensor: _Sensor) -> Floats:
         """Acquire the frame as if it were the first, and return the model of it alone."""
         seeds = SeedGrid.measured(sensor, self.shape, self._grid.shape, camera=self._grid.camera)
         spent = len(self._lattice_uv)
@@ -353,7 +354,7 @@ class TemporalAcquisition:
         self._book(sensor, first)
 
 
-def _votes_about(uv: npt.NDArray[np.int32], votes: npt.NDArray[np.uint8]) -> npt.NDArray[np.integer]:
+def _votes_about(uv: Ints, votes: Bytes) -> npt.NDArray[np.integer]:
     """How many of the pixels measured beside each contradicted, shape (n,)."""
     padded = np.pad(votes, NEAR_PX)
     u, v = uv[:, 0] + NEAR_PX, uv[:, 1] + NEAR_PX

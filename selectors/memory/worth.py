@@ -12,10 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import betainc
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Floats, Ints
 from selective_depth.selectors.memory.store import KEPT, Memory
 
 PRIOR = 0.5
@@ -47,7 +47,7 @@ class Noise:
     per_mm: float = 1.4e-6
 
 
-def _wrong() -> npt.NDArray[np.float32]:
+def _wrong() -> Floats:
     """Chance that the minority of k of n observations is right, shape (KEPT + 1, KEPT + 1)."""
     n, k = np.meshgrid(np.arange(KEPT + 1), np.arange(KEPT + 1), indexing="ij")
     k = np.minimum(k, n)
@@ -62,13 +62,13 @@ def shot_worth(
     first_row: int,
     end_row: int,
     memory: Memory,
-    model_mm: npt.NDArray[np.float32],
-    gap_sq: npt.NDArray[np.int32],
+    model_mm: Floats,
+    gap_sq: Ints,
     reach_sq: float,
     noise: tuple[float, float],
     now: int,
-    wrong: npt.NDArray[np.float32],
-    worth: npt.NDArray[np.float32],
+    wrong: Floats,
+    worth: Floats,
 ) -> None:
     """Score some rows: squared millimetres that a shot is expected to remove.
 

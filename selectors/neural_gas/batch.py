@@ -8,10 +8,10 @@ from functools import partial
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Bools, Floats, Ints
 from selective_depth.selectors.neural_gas.exact import draw_nodes
 from selective_depth.selectors.parallel import in_bands
 
@@ -66,9 +66,9 @@ class BatchNeuralGas:
         Whether the last update took the passes of a cold training because the scene had changed.
     """
 
-    nodes_mm_: npt.NDArray[np.float32]
-    nodes_uv_: npt.NDArray[np.float32]
-    won_: npt.NDArray[np.bool_]
+    nodes_mm_: Floats
+    nodes_uv_: Floats
+    won_: Bools
     quantisation_error_mm_: float
     reheated_: bool
 
@@ -77,7 +77,7 @@ class BatchNeuralGas:
         self._seed = seed
         self._threads = threads
 
-    def train(self, points_mm: npt.NDArray[np.float32], uv: npt.NDArray[np.int32]) -> Self:
+    def train(self, points_mm: Floats, uv: Ints) -> Self:
         """Train from nothing.
 
         Parameters
@@ -97,16 +97,14 @@ class BatchNeuralGas:
         self.reheated_ = False
         return self
 
-    def update(self, points_mm: npt.NDArray[np.float32], uv: npt.NDArray[np.int32]) -> Self:
+    def update(self, points_mm: Floats, uv: Ints) -> Self:
         """Go on from the last frame's nodes; the first update trains. Arguments as for `train`."""
         if not hasattr(self, "nodes_mm_"):
             return self.train(points_mm, uv)
         self._pass(points_mm, uv, LIVE_PASSES, REHEAT_AT * self.quantisation_error_mm_)
         return self
 
-    def adopt(
-        self, nodes_mm: npt.NDArray[np.float32], nodes_uv: npt.NDArray[np.float32], points_mm: npt.NDArray[np.float32]
-    ) -> Self:
+    def adopt(self, nodes_mm: Floats, nodes_uv: Floats, points_mm: Floats) -> Self:
         """Take over nodes trained otherwise, to go on from them.
 
         Parameters
@@ -125,9 +123,7 @@ class BatchNeuralGas:
         self.reheated_ = False
         return self
 
-    def _pass(
-        self, points: npt.NDArray[np.float32], pixels: npt.NDArray[np.int32], passes: int, most: float = math.inf
-    ) -> None:
+    def _pass(self, points: Floats, pixels: Ints, passes: int, most: float = math.inf) -> None:
         """Take batch passes; as many as from nothing if the error at first is above `most`."""
         uv = pixels.astype(np.float32)
         # Axis by axis: NumPy reduces an array this narrow along its length 20 times slower.
@@ -159,7 +155,7 @@ class BatchNeuralGas:
         self.quantisation_error_mm_ = _mean_distance(d2[0])
 
 
-def _mean_distance(d2: npt.NDArray[np.float32]) -> float:
+def _mean_distance(d2: Floats) -> float:
     return float(np.sqrt(d2).mean(dtype=np.float64))
 
 

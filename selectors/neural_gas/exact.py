@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Floats, Ints
 
 ALPHA = (0.5, 0.005)
 """First and last learning rate. The first is the paper's; both are SOM Toolbox's defaults."""
@@ -23,7 +23,7 @@ _SLACK = 1.2  # how much farther than expected the nodes that move are looked fo
 _FAR = 1e18  # where the padding of the last groups lies: its square is still finite
 
 
-def draw_nodes(points_mm: npt.NDArray[np.float32], nodes: int, rng: np.random.Generator) -> npt.NDArray[np.float32]:
+def draw_nodes(points_mm: Floats, nodes: int, rng: np.random.Generator) -> Floats:
     """Draw the first nodes from the points, without replacement as long as they last.
 
     Returns
@@ -36,7 +36,7 @@ def draw_nodes(points_mm: npt.NDArray[np.float32], nodes: int, rng: np.random.Ge
     return points_mm[np.concatenate((np.arange(count), rng.integers(0, count, nodes - count)))]
 
 
-def train_exact(points_mm: npt.NDArray[np.float32], nodes: int, epochs: int, seed: int) -> npt.NDArray[np.float32]:
+def train_exact(points_mm: Floats, nodes: int, epochs: int, seed: int) -> Floats:
     """Train neural gas from nothing with the published steps.
 
     Samples are drawn with replacement, ``epochs * len(points_mm)`` of them, and each moves the
@@ -67,9 +67,7 @@ def train_exact(points_mm: npt.NDArray[np.float32], nodes: int, epochs: int, see
     return anneal(points_mm, first, draws)
 
 
-def anneal(
-    points_mm: npt.NDArray[np.float32], nodes_mm: npt.NDArray[np.float32], draws: npt.NDArray[np.int32]
-) -> npt.NDArray[np.float32]:
+def anneal(points_mm: Floats, nodes_mm: Floats, draws: Ints) -> Floats:
     """Take the published steps from given nodes, over given draws.
 
     Parameters
@@ -90,7 +88,7 @@ def anneal(
     groups = -(-count // _MEMBERS)
     padded = np.full((3, _MEMBERS * groups), _FAR)
     padded[:, :count] = nodes_mm.T
-    settled: npt.NDArray[np.float32] = _anneal(
+    settled: Floats = _anneal(
         points_mm.astype(np.float64), padded.reshape(3, _MEMBERS, groups), count, draws, max(count / 2, LAMBDA_LAST)
     )
     return settled

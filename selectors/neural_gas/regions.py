@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Bools, Floats, Ints
 from selective_depth.selectors.even import even_rank, spread
 from selective_depth.selectors.selection import Selection
 from selective_depth.selectors.triangulation import Mesh
@@ -57,19 +57,19 @@ class RegionSelection(Selection):
         `nodes_uv` rounded as they were triangulated and drawn.
     """
 
-    nodes_mm: npt.NDArray[np.float32]
-    nodes_uv: npt.NDArray[np.float32]
-    triangles: npt.NDArray[np.int32]
-    edge_lengths: npt.NDArray[np.float32]
-    kept: npt.NDArray[np.bool_]
+    nodes_mm: Floats
+    nodes_uv: Floats
+    triangles: Ints
+    edge_lengths: Floats
+    kept: Bools
     threshold: float
     edge_metric: str
-    complement: npt.NDArray[np.bool_]
+    complement: Bools
     quantisation_error_mm: float
-    drawn_uv: npt.NDArray[np.float32]
+    drawn_uv: Floats
 
     @property
-    def worth(self) -> npt.NDArray[np.float32]:
+    def worth(self) -> Floats:
         """What shots are chosen by: they fill the surviving triangles evenly, then the rest."""
         return spread(self.mask)
 
@@ -97,8 +97,8 @@ class RegionSelection(Selection):
 
 
 def delaunay_regions(
-    nodes_mm: npt.NDArray[np.float32],
-    nodes_uv: npt.NDArray[np.float32],
+    nodes_mm: Floats,
+    nodes_uv: Floats,
     frame_shape: tuple[int, int],
     *,
     edge_metric: EdgeMetric = "3d",
@@ -166,7 +166,7 @@ def delaunay_regions(
     )
 
 
-def triangulate(uv: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+def triangulate(uv: Floats) -> tuple[Ints, Floats]:
     """Delaunay triangulation of points of the image plane.
 
     The points are first rounded to a fraction of a pixel: in whole numbers the triangulation is

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from selective_depth.selectors.arrays import Doubles, Floats
 from selective_depth.selectors.neural_gas.batch import BatchNeuralGas
 from selective_depth.selectors.neural_gas.exact import train_exact
 from selective_depth.selectors.neural_gas.regions import EdgeMetric, RegionSelection, delaunay_regions
@@ -188,7 +188,7 @@ class LongEdgeSelector:
         return self.gas.select(samples).long_edges()
 
 
-def node_pixels(nodes_mm: npt.NDArray[np.float32], samples: SeedGrid | Samples) -> npt.NDArray[np.float32]:
+def node_pixels(nodes_mm: Floats, samples: SeedGrid | Samples) -> Floats:
     """Pixels (column, row) on which nodes fall.
 
     Parameters
@@ -212,11 +212,11 @@ def node_pixels(nodes_mm: npt.NDArray[np.float32], samples: SeedGrid | Samples) 
     weight = 1 / (distance + 1e-3)
     # Neighbours in space may lie at both ends of a panorama's rows: no mean over the seam.
     weight[np.abs(uv[..., 0] - uv[:, :1, 0]) > samples.frame_shape[1] / 4] = 0
-    mean: npt.NDArray[np.float64] = (uv * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[:, None]
+    mean: Doubles = (uv * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[:, None]
     return mean.astype(np.float32)
 
 
-def _finite_points(samples: SeedGrid | Samples) -> npt.NDArray[np.float32]:
+def _finite_points(samples: SeedGrid | Samples) -> Floats:
     points = samples.points_mm
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points).all(axis=1)).sum())

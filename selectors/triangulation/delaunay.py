@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Bools, Ints, Longs
 
 GHOST = -1
 """The vertex at infinity."""
@@ -26,18 +27,16 @@ GHOST = -1
 _BIN_PX = 8  # least side of the square bins that remember a triangle to start a search from
 _NEXT = np.array([1, 2, 0, 1], np.int64)
 
-Int32Array = npt.NDArray[np.int32]
-
 
 @njit(cache=True, nogil=True, inline="always")
-def _orient(uv: Int32Array, a: int, b: int, c: int) -> int:
+def _orient(uv: Ints, a: int, b: int, c: int) -> int:
     """Twice the signed area of the triangle a, b, c: positive if c is on the left of ab."""
     au, av = np.int64(uv[a, 0]), np.int64(uv[a, 1])
     return int((uv[b, 0] - au) * (uv[c, 1] - av) - (uv[c, 0] - au) * (uv[b, 1] - av))
 
 
 @njit(cache=True, nogil=True)
-def _in_disk(uv: Int32Array, a: int, b: int, c: int, p: int) -> bool:
+def _in_disk(uv: Ints, a: int, b: int, c: int, p: int) -> bool:
     """Is p strictly inside the circle through a, b, c (one of which may be the ghost)?"""
     if a == GHOST or b == GHOST or c == GHOST:
         if a == GHOST:
@@ -63,7 +62,7 @@ def _in_disk(uv: Int32Array, a: int, b: int, c: int, p: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _locate(uv: Int32Array, tri: Int32Array, adj: Int32Array, p: int, t: int) -> int:
+def _locate(uv: Ints, tri: Ints, adj: Ints, p: int, t: int) -> int:
     """Triangle that holds p, or a ghost triangle whose hull edge p sees, walking from t."""
     came = -1
     while True:
@@ -86,7 +85,7 @@ def _locate(uv: Int32Array, tri: Int32Array, adj: Int32Array, p: int, t: int) ->
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _relink(adj: Int32Array, t: int, old: int, new: int) -> None:
+def _relink(adj: Ints, t: int, old: int, new: int) -> None:
     """Tell triangle t that its neighbour `old` is now `new`."""
     if adj[t, 0] == old:
         adj[t, 0] = new
@@ -97,16 +96,7 @@ def _relink(adj: Int32Array, t: int, old: int, new: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _insert(
-    uv: Int32Array,
-    tri: Int32Array,
-    adj: Int32Array,
-    count: int,
-    p: int,
-    t: int,
-    stack: Int32Array,
-    changed: npt.NDArray[np.bool_],
-) -> None:
+def _insert(uv: Ints, tri: Ints, adj: Ints, count: int, p: int, t: int, stack: Ints, changed: Bools) -> None:
     """Insert p into its triangle t; the two new triangles are `count` and `count + 1`."""
     a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
     na, nb, nc = adj[t, 0], adj[t, 1], adj[t, 2]
@@ -149,7 +139,7 @@ def _insert(
 
 
 @njit(cache=True, nogil=True)
-def _first_triangle(uv: Int32Array, n: int, tri: Int32Array, adj: Int32Array) -> int:
+def _first_triangle(uv: Ints, n: int, tri: Ints, adj: Ints) -> int:
     """Make a triangle of points 0, 1 and the first off their line, whose index is returned."""
     third = 2
     while third < n and _orient(uv, 0, 1, third) == 0:
@@ -172,16 +162,7 @@ def _first_triangle(uv: Int32Array, n: int, tri: Int32Array, adj: Int32Array) ->
 
 @njit(cache=True, nogil=True)
 def _insert_all(
-    uv: Int32Array,
-    first: int,
-    end: int,
-    skip: int,
-    tri: Int32Array,
-    adj: Int32Array,
-    count: int,
-    bins: Int32Array,
-    bin_px: int,
-    changed: npt.NDArray[np.bool_],
+    uv: Ints, first: int, end: int, skip: int, tri: Ints, adj: Ints, count: int, bins: Ints, bin_px: int, changed: Bools
 ) -> int:
     """Insert the points first..end but `skip`; returns the new number of triangles."""
     stack = np.empty(4096, np.int32)
@@ -199,7 +180,7 @@ def _insert_all(
 
 
 @njit(cache=True, nogil=True)
-def _brio_keys(uv: Int32Array, keys: npt.NDArray[np.int64]) -> None:
+def _brio_keys(uv: Ints, keys: Longs) -> None:
     """Sort keys of an order that inserts fast: rounds of doubling size, each in snake tiles."""
     for i in range(len(uv)):
         u, v = np.int64(uv[i, 0]), np.int64(uv[i, 1])
@@ -232,12 +213,12 @@ class Mesh:
         Triangles made or reshaped since the caller last cleared it.
     """
 
-    uv: Int32Array
-    tri: Int32Array
-    adj: Int32Array
-    bins: Int32Array
+    uv: Ints
+    tri: Ints
+    adj: Ints
+    bins: Ints
     bin_px: int
-    changed: npt.NDArray[np.bool_]
+    changed: Bools
     points: int
     triangles: int
 
@@ -317,8 +298,8 @@ class Mesh:
         )
         self.points = end
 
-    def real_triangles(self) -> Int32Array:
+    def real_triangles(self) -> Ints:
         """Vertices of the triangles inside the hull, shape (t, 3)."""
         tri = self.tri[: self.triangles]
-        real: Int32Array = tri[(tri != GHOST).all(axis=1)]
+        real: Ints = tri[(tri != GHOST).all(axis=1)]
         return real

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Bools, Ints
 from selective_depth.selectors.parallel import in_bands
 
 FAR_SQ = np.int32(1 << 30)
@@ -15,9 +15,7 @@ _FAR = 1 << 20  # farther than any row of any image, and its square fits in 64 b
 
 
 @njit(cache=True, nogil=True)
-def _nearest_row_in_column(
-    valid: npt.NDArray[np.bool_], nearest_row: npt.NDArray[np.int32], first: int, end: int
-) -> None:
+def _nearest_row_in_column(valid: Bools, nearest_row: Ints, first: int, end: int) -> None:
     """Per pixel of the columns first..end, the nearest row of its column with a sample."""
     height = valid.shape[0]
     for u in range(first, end):
@@ -35,13 +33,7 @@ def _nearest_row_in_column(
 
 
 @njit(cache=True, nogil=True)
-def _nearest_along_rows(
-    nearest_row: npt.NDArray[np.int32],
-    nearest: npt.NDArray[np.int32],
-    gap_sq: npt.NDArray[np.int32],
-    first: int,
-    end: int,
-) -> None:
+def _nearest_along_rows(nearest_row: Ints, nearest: Ints, gap_sq: Ints, first: int, end: int) -> None:
     """Lower envelope of the columns' parabolas, row by row: the exact nearest sample."""
     width = nearest_row.shape[1]
     column = np.empty(width, np.int64)  # of the parabolas on the envelope
@@ -81,9 +73,7 @@ def _nearest_along_rows(
             gap_sq[v, u] = height_sq[top] + (u - column[top]) ** 2
 
 
-def nearest_sample(
-    valid: npt.NDArray[np.bool_], threads: int | None = None
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+def nearest_sample(valid: Bools, threads: int | None = None) -> tuple[Ints, Ints]:
     """Nearest sample of every pixel, exactly, in time linear in the pixels.
 
     Parameters

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Bools, Floats, Ints
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.triangulation.delaunay import GHOST, Mesh
 from selective_depth.selectors.triangulation.nearest import FAR_SQ, nearest_sample
@@ -30,8 +31,6 @@ MANY_TRIANGLES = 20_000
 TILE_PX = 16
 """Side of the square tiles in which changes are booked."""
 
-Float32Array = npt.NDArray[np.float32]
-Int32Array = npt.NDArray[np.int32]
 Whole = int | np.int32 | np.int64
 
 
@@ -59,17 +58,17 @@ class Layers(NamedTuple):
         Tiles in which, or beside which, a pixel may have changed since the reader cleared it.
     """
 
-    samples_mm: Float32Array
-    nearest: Int32Array
-    gap_sq: Int32Array
-    depth_mm: Float32Array
-    plain: npt.NDArray[np.bool_]
-    spread_mm2: Float32Array
-    touched: npt.NDArray[np.bool_]
+    samples_mm: Floats
+    nearest: Ints
+    gap_sq: Ints
+    depth_mm: Floats
+    plain: Bools
+    spread_mm2: Floats
+    touched: Bools
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _touch(touched: npt.NDArray[np.bool_], top: Whole, left: Whole, bottom: Whole, right: Whole) -> None:
+def _touch(touched: Bools, top: Whole, left: Whole, bottom: Whole, right: Whole) -> None:
     """Book a change of pixels in these rows and columns, which their neighbours may heed."""
     rows, columns = touched.shape
     first_column, last_column = max(left - 1, 0) // TILE_PX, (right + 1) // TILE_PX
@@ -79,7 +78,7 @@ def _touch(touched: npt.NDArray[np.bool_], top: Whole, left: Whole, bottom: Whol
 
 
 @njit(cache=True, nogil=True)
-def _claim(layers: Layers, uv: Int32Array) -> None:
+def _claim(layers: Layers, uv: Ints) -> None:
     """Give every new sample the pixels that lie nearer to it than to any other.
 
     They form a convex region about the sample: in each row one run, which touches that of the
@@ -120,7 +119,7 @@ def _claim(layers: Layers, uv: Int32Array) -> None:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _bridges(uv: Int32Array, z_mm: Float32Array, corners: Int32Array, step_mm: float, bridge_px: float) -> bool:
+def _bridges(uv: Ints, z_mm: Floats, corners: Ints, step_mm: float, bridge_px: float) -> bool:
     """Whether a triangle of three points spans a hole or a depth step."""
     a, b, c = corners[0], corners[1], corners[2]
     if max(z_mm[a], z_mm[b], z_mm[c]) - min(z_mm[a], z_mm[b], z_mm[c]) <= step_mm:
@@ -134,7 +133,7 @@ def _bridges(uv: Int32Array, z_mm: Float32Array, corners: Int32Array, step_mm: f
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def _along_edge(uv: Int32Array, z_mm: Float32Array, corners: Int32Array, across: int, u: int, v: int) -> np.float32:
+def _along_edge(uv: Ints, z_mm: Floats, corners: Ints, across: int, u: int, v: int) -> np.float32:
     """Depth at a pixel of the edge across from a corner: to the last bit, either triangle's."""
     a, b = corners[(across + 1) % 3], corners[(across + 2) % 3]
     if a > b:
@@ -146,13 +145,7 @@ def _along_edge(uv: Int32Array, z_mm: Float32Array, corners: Int32Array, across:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw(
-    layers: Layers,
-    uv: Int32Array,
-    z_mm: Float32Array,
-    tri: Int32Array,
-    adj: Int32Array,
-    changed: Int32Array,
-    limits: tuple[float, float],
+    layers: Layers, uv: Ints, z_mm: Floats, tri: Ints, adj: Ints, changed: Ints, limits: tuple[float, float]
 ) -> None:
     """Draw triangles into the model: those that bridge nothing linearly, the others not at all.
 
@@ -218,7 +211,7 @@ def _draw(
 
 
 @njit(cache=True, nogil=True)
-def _mark_stars(tri: Int32Array, adj: Int32Array, other: npt.NDArray[np.bool_], changed: npt.NDArray[np.bool_]) -> None:
+def _mark_stars(tri: Ints, adj: Ints, other: Bools, changed: Bools) -> None:
     """Mark the triangles of points whose depth is another now, and those that share an edge."""
     for t in range(len(tri)):
         for k in range(3):
@@ -281,7 +274,7 @@ class Surface:
         """How many samples it holds."""
         return len(self._uv)
 
-    def add(self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.generic]) -> None:
+    def add(self, uv: Ints, depth_mm: npt.NDArray[np.generic]) -> None:
         """Take in samples: pixels (n, 2), column first, none given before, and depth (n,) in mm.
 
         Those without depth (0 or negative) are left out.
@@ -289,7 +282,7 @@ class Surface:
         self._insert(uv, depth_mm)
         self._draw_changed()
 
-    def put(self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.float32]) -> None:
+    def put(self, uv: Ints, depth_mm: Floats) -> None:
         """As `add`, but some of the pixels may have been given before: they get another depth."""
         point = self._point[uv[:, 1], uv[:, 0]]
         again = (point >= 0) & (depth_mm > 0)
@@ -307,7 +300,7 @@ class Surface:
         if differ.any():
             _renew_far(self.layers)
 
-    def _insert(self, uv: npt.NDArray[np.int32], depth_mm: npt.NDArray[np.generic]) -> None:
+    def _insert(self, uv: Ints, depth_mm: npt.NDArray[np.generic]) -> None:
         """Take in samples without drawing them."""
         mm = depth_mm.astype(np.float32)
         returned = mm > 0
