@@ -91,6 +91,12 @@ def pixels_in(uv: npt.ArrayLike, shape: tuple[int, int], name: str = "uv") -> In
     return np.ascontiguousarray(given, np.int32)
 
 
+def pixels_where(image: npt.NDArray[np.generic]) -> Ints:
+    """Pixels, column first, at which an image is not 0: shape (n, 2), row by row."""
+    rows, columns = np.nonzero(image)
+    return np.stack((columns, rows), axis=-1).astype(np.int32)
+
+
 def sample_pairs(uv: npt.ArrayLike, depth_mm: npt.ArrayLike, shape: tuple[int, int]) -> tuple[Ints, Floats]:
     """Pixels and their depths, checked and of one length; see `pixels_in` and `measured_mm`."""
     pixels, mm = pixels_in(uv, shape), measured_mm(depth_mm)

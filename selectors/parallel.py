@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 
 
 def default_threads() -> int:
@@ -29,8 +30,8 @@ def _pool(process_id: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=max(default_threads(), 1), thread_name_prefix="kernel")
 
 
-def in_bands(kernel: Callable[[int, int], object], rows: int, threads: int | None = None) -> None:
-    """Call ``kernel(first_row, end_row)`` over bands of rows, in parallel, and wait for all.
+def in_bands(kernel: Callable[..., object], rows: int, threads: int | None, *arguments: object) -> None:
+    """Call ``kernel(first_row, end_row, *arguments)`` over bands of rows, in parallel; wait for all.
 
     Parameters
     ----------
@@ -38,18 +39,20 @@ def in_bands(kernel: Callable[[int, int], object], rows: int, threads: int | Non
         Must release the GIL and write only to its own rows.
     rows : int
         Number of rows in all.
-    threads : int, optional
-        How many bands; default `default_threads()`. 1 runs in the calling thread.
+    threads : int or None
+        How many bands; None is `default_threads()`. 1 runs in the calling thread.
+    *arguments
+        What else the kernel takes.
     """
     count = min(threads or default_threads(), rows)
     if count <= 1:
-        kernel(0, rows)
+        kernel(0, rows, *arguments)
         return
     edges = [rows * band // count for band in range(count + 1)]
     pool = _pool(os.getpid())
-    waiting = [pool.submit(kernel, edges[band], edges[band + 1]) for band in range(1, count)]
+    waiting = [pool.submit(kernel, *band, *arguments) for band in pairwise(edges[1:])]
     try:
-        kernel(edges[0], edges[1])
+        kernel(edges[0], edges[1], *arguments)
     finally:
         # Even if this band fails, no other may still be writing when we return.
         for future in waiting:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.selectors.arrays import Floats, sample_pairs
+from selective_depth.selectors.arrays import Floats, pixels_where, sample_pairs
 from selective_depth.selectors.triangulation import Surface
 
 
@@ -45,7 +45,6 @@ def reconstruct(
     pixels, mm = sample_pairs(uv, depth_mm, shape)
     samples_mm = np.zeros(shape, np.float32)
     samples_mm[pixels[:, 1], pixels[:, 0]] = mm
-    rows, columns = np.nonzero(samples_mm)
     surface = Surface(shape, threads)
-    surface.add(np.stack((columns, rows), axis=-1).astype(np.int32), samples_mm[rows, columns])
+    surface.add(pixels_where(samples_mm), samples_mm[samples_mm > 0])
     return surface.layers.depth_mm

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from selective_depth.drivers.frame import Camera
 from selective_depth.drivers.kernels import njit
-from selective_depth.selectors.arrays import Bools, Floats, Ints, sample_pairs
+from selective_depth.selectors.arrays import Bools, Floats, Ints, pixels_where, sample_pairs
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.triangulation import FAR_SQ, nearest_sample
 
@@ -136,7 +136,7 @@ class Samples:
     @property
     def uv(self) -> Ints:
         """Pixels (column, row) of the samples that returned depth, shape (n, 2), row by row."""
-        return np.argwhere(self.image_mm > 0)[:, ::-1].astype(np.int32)
+        return pixels_where(self.image_mm > 0)
 
     @property
     def depth_mm(self) -> Floats:

@@ -80,9 +80,5 @@ class StepSelector:
             noise_mm2=self.noise_mm**2,
         )
         score = np.empty(known.frame_shape, np.float32)
-
-        def band(first: int, end: int) -> None:
-            score_rows(first, end, known.image_mm, known.bits, rule, score)
-
-        in_bands(band, len(score), self.threads)
+        in_bands(score_rows, len(score), self.threads, known.image_mm, known.bits, rule, score)
         return Selection.of_score(score, self.name)

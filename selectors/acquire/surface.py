@@ -46,13 +46,19 @@ def _note_misses(uv: Ints, depth_mm: Floats, radius: int, miss_sq: Ints, touched
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _score_tiles(
-    tiles: Longs, layers: Layers, image_mm: Floats, miss_sq: Ints, reach_sq: float, noise_mm2: float, score: Floats
+    first: int, end: int, tiles: Longs, layers: Layers, images: tuple[Floats, Ints, Floats], limits: tuple[float, float]
 ) -> None:
-    """Score the pixels of some tiles, numbered row by row; `image_mm` is that of the samples."""
+    """Score the pixels of the tiles first..end, numbered row by row.
+
+    `images`: the samples (mm), the squared distance to the nearest miss, and the score, filled in;
+    `limits`: the squared reach of shots, pixels, and the variance where all agree, mm^2.
+    """
+    image_mm, miss_sq, score = images
+    reach_sq, noise_mm2 = limits
     height, width = score.shape
     columns = layers.touched.shape[1]
     depth = layers.depth_mm
-    for tile in tiles:
+    for tile in tiles[first:end]:
         top, left = tile // columns * TILE_PX, tile % columns * TILE_PX
         for v in range(top, min(top + TILE_PX, height)):
             above, below = max(v - 1, 0), min(v + 1, height - 1)
@@ -133,19 +139,9 @@ class SurfacePlan:
         self._seen = samples.additions
         tiles = np.flatnonzero(layers.touched)
         layers.touched[:] = False
-
-        def band(first: int, end: int) -> None:
-            _score_tiles(
-                tiles[first:end],
-                layers,
-                samples.image_mm,
-                self._miss_sq,
-                float(samples.reach_px**2),
-                float(self._rule.noise_mm**2),
-                self.score,
-            )
-
-        in_bands(band, len(tiles), self._rule.threads)
+        limits = float(samples.reach_px**2), float(self._rule.noise_mm**2)
+        images = samples.image_mm, self._miss_sq, self.score
+        in_bands(_score_tiles, len(tiles), self._rule.threads, tiles, layers, images, limits)
 
     def best(self, shots: int) -> Ints:
         """The `shots` pixels that are worth most, from the samples as they are now."""

@@ -16,7 +16,7 @@ from scipy.ndimage import maximum_filter
 
 from selective_depth.drivers.frame import Camera
 from selective_depth.selectors.acquire import acquire, shots_of
-from selective_depth.selectors.arrays import Bools, Bytes, Floats, Ints
+from selective_depth.selectors.arrays import Bools, Bytes, Floats, Ints, pixels_where
 from selective_depth.selectors.choice import choose
 from selective_depth.selectors.memory.change import MARGIN_PX, MOVED, NEAR_PX, Extent, around, contradicts, drift
 from selective_depth.selectors.memory.store import Memory, book, forget
@@ -297,19 +297,16 @@ class TemporalAcquisition:
             new = sensor.unasked(choose(border_px, shots, threads=self._threads))
             extent.add(new, contradicts(new, sensor(new), model_mm))
         where, _ = extent.changed()
-        side = 2 * MARGIN_PX + 1
-        changed[:] = maximum_filter(where, side)
+        changed[:] = maximum_filter(where, 2 * MARGIN_PX + 1)
         return True
 
     def _start(self, sensor: _Sensor) -> Floats:
         """Acquire the frame as if it were the first, and return the model of it alone."""
         seeds = SeedGrid.measured(sensor, self.shape, self._grid.shape, camera=self._grid.camera)
-        spent = len(self._lattice_uv)
-        shots = max(self._first_shots, self._shots - spent)
+        shots = max(self._first_shots, self._shots - len(self._lattice_uv))
         acquisition = acquire(
-            sensor, seeds, rounds=self._rounds, selector=self._selector, shots=shots,
-            threads=self._threads,
-        )  # fmt: skip
+            sensor, seeds, rounds=self._rounds, selector=self._selector, shots=shots, threads=self._threads
+        )
         self._by = acquisition.by
         self._book(sensor, 0, anew=True)
         return acquisition.reconstruct(self._threads)
@@ -321,8 +318,7 @@ class TemporalAcquisition:
         book(self._memory, uv, mm, self._frame)
         if anew:  # no point is ever taken out of a mesh
             self._surface = Surface(self.shape, self._threads)
-            rows, columns = np.nonzero(self._memory.held)
-            uv = np.stack((columns, rows), axis=-1).astype(np.int32)
+            uv = pixels_where(self._memory.held)
         self._surface.put(uv, self._memory.fused_mm[uv[:, 1], uv[:, 0]])
         if self._surface.points - np.count_nonzero(self._memory.held) > MOST_LOST:
             self._book(sensor, len(sensor.uv), anew=True)
@@ -333,19 +329,13 @@ class TemporalAcquisition:
             return
         worth = np.empty(self.shape, np.float32)
         layers, noise = self._surface.layers, (self._noise.floor_mm, self._noise.per_mm)
-
-        def band(first_row: int, end_row: int) -> None:
-            shot_worth(
-                first_row, end_row, self._memory, layers.depth_mm, layers.gap_sq, self._reach_sq,
-                noise, self._frame, WRONG, worth,
-            )  # fmt: skip
-
-        in_bands(band, self.shape[0], self._threads)
+        known = self._memory, layers.depth_mm, layers.gap_sq
+        in_bands(shot_worth, len(worth), self._threads, *known, self._reach_sq, noise, self._frame, WRONG, worth)
         first = len(sensor.uv)
         if self._selector is not None:
             samples = Samples(self.shape, (self._reach_sq**0.5) / 1.3)
-            rows, columns = np.nonzero(self._memory.held)
-            samples.add(np.stack((columns, rows), axis=-1), self._memory.fused_mm[rows, columns])
+            held = self._memory.held > 0
+            samples.add(pixels_where(held), self._memory.fused_mm[held])
             new = plan_of(self._selector, samples, self._threads).best(shots // 2)
             sensor(sensor.unasked(new))
             worth[self._memory.held == 0] = 0

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
 from typing import Self
 
 import numpy as np
@@ -55,7 +53,7 @@ class BatchNeuralGas:
     Attributes
     ----------
     nodes_mm_ : float32 array of shape (N, 3)
-        Nodes in space.
+        Nodes in space; none before the first training.
     nodes_uv_ : float32 array of shape (N, 2)
         Mean pixel (column, row) of the seeds each node won.
     won_ : bool array of shape (N,)
@@ -66,16 +64,13 @@ class BatchNeuralGas:
         Whether the last update took the passes of a cold training because the scene had changed.
     """
 
-    nodes_mm_: Floats
-    nodes_uv_: Floats
-    won_: Bools
-    quantisation_error_mm_: float
-    reheated_: bool
-
     def __init__(self, nodes: int, seed: int, threads: int | None = None) -> None:
-        self._nodes = nodes
-        self._seed = seed
-        self._threads = threads
+        self._nodes, self._seed, self._threads = nodes, seed, threads
+        self.nodes_mm_: Floats = np.zeros((0, 3), np.float32)
+        self.nodes_uv_: Floats = np.zeros((0, 2), np.float32)
+        self.won_: Bools = np.zeros(0, np.bool_)
+        self.quantisation_error_mm_ = math.nan
+        self.reheated_ = False
 
     def train(self, points_mm: Floats, uv: Ints) -> Self:
         """Train from nothing.
@@ -99,7 +94,7 @@ class BatchNeuralGas:
 
     def update(self, points_mm: Floats, uv: Ints) -> Self:
         """Go on from the last frame's nodes; the first update trains. Arguments as for `train`."""
-        if not hasattr(self, "nodes_mm_"):
+        if len(self.nodes_mm_) == 0:
             return self.train(points_mm, uv)
         self._pass(points_mm, uv, LIVE_PASSES, REHEAT_AT * self.quantisation_error_mm_)
         return self
@@ -135,11 +130,10 @@ class BatchNeuralGas:
         self.nodes_uv_ -= low
         winner = np.empty(len(points), dtype=np.int32)
         d2 = np.empty((2, len(points)), dtype=np.float32)
-        find: Callable[..., None] = _find_two
         done = 0
         while True:
             bins = _sort_into_bins(self.nodes_mm_, self.nodes_uv_, bin_px, rows, columns)
-            in_bands(partial(find, points, uv, bin_px, rows, columns, *bins, winner, d2), len(points), self._threads)
+            in_bands(_find_two, len(points), self._threads, points, uv, bin_px, rows, columns, *bins, winner, d2)
             if done == 0:
                 self.reheated_ = _mean_distance(d2[0]) > most
                 passes = COLD_PASSES if self.reheated_ else passes
@@ -186,7 +180,7 @@ def _sort_into_bins(nodes, nodes_uv, bin_px, rows, columns):  # type: ignore[no-
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz", "contract"})
 def _find_two(  # type: ignore[no-untyped-def]
-    points, uv, bin_px, rows, columns, starts, number, xyz, winner, d2, first, end
+    first, end, points, uv, bin_px, rows, columns, starts, number, xyz, winner, d2
 ):
     """Winners of the seeds first..end among the bins around each; distances of the nearest two."""
     sx, sy, sz = xyz[0], xyz[1], xyz[2]

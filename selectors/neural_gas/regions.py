@@ -96,6 +96,14 @@ class RegionSelection(Selection):
         return Selection(self.complement, score, "neural gas, long edges")
 
 
+def check_edges(edge_metric: str, factor: float) -> None:
+    """Refuse a measure of edges, or a factor of their threshold, that there is not."""
+    if edge_metric not in ("3d", "image"):
+        raise ValueError(f"edge_metric is {edge_metric!r}; give '3d' or 'image'")
+    if not factor > 0:
+        raise ValueError(f"factor is {factor}; the threshold must be positive, 1 is the mean edge")
+
+
 def delaunay_regions(
     nodes_mm: Floats,
     nodes_uv: Floats,
@@ -133,10 +141,7 @@ def delaunay_regions(
     ValueError
         If `edge_metric` or `factor` is not allowed.
     """
-    if edge_metric not in ("3d", "image"):
-        raise ValueError(f"edge_metric is {edge_metric!r}; give '3d' or 'image'")
-    if not factor > 0:
-        raise ValueError(f"factor is {factor}; the threshold must be positive, 1 is the mean edge")
+    check_edges(edge_metric, factor)
     triangles, drawn_uv = triangulate(nodes_uv)
     edge_lengths = _edge_lengths(nodes_mm if edge_metric == "3d" else nodes_uv, triangles)
     threshold = factor * float(edge_lengths.mean(dtype=np.float64)) if len(triangles) else 0.0

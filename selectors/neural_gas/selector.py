@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from selective_depth.selectors.arrays import Doubles, Floats
 from selective_depth.selectors.neural_gas.batch import BatchNeuralGas
 from selective_depth.selectors.neural_gas.exact import train_exact
-from selective_depth.selectors.neural_gas.regions import EdgeMetric, RegionSelection, delaunay_regions
+from selective_depth.selectors.neural_gas.regions import EdgeMetric, RegionSelection, check_edges, delaunay_regions
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.selection import Selection
@@ -20,6 +20,7 @@ from selective_depth.selectors.selection import Selection
 Algorithm = Literal["exact", "fast"]
 
 
+@dataclass(eq=False)
 class NeuralGasSelector:
     """Select regions by neural gas.
 
@@ -68,38 +69,26 @@ class NeuralGasSelector:
     in Machine Perception", section III, eq. (1)-(4).
     """
 
+    nodes: int = 2800
+    epochs: int = 50
+    algorithm: Algorithm = "fast"
+    seed: int = 0
+    edge_metric: EdgeMetric = "3d"
+    factor: float = 1.0
+    threads: int | None = None
     name = "neural gas"
 
-    def __init__(
-        self,
-        nodes: int = 2800,
-        epochs: int = 50,
-        algorithm: Algorithm = "fast",
-        seed: int = 0,
-        edge_metric: EdgeMetric = "3d",
-        factor: float = 1.0,
-        threads: int | None = None,
-    ) -> None:
-        if nodes < 1:
-            raise ValueError(f"nodes is {nodes}; give at least 1, the paper takes 1400 to 2800")
-        if epochs < 1:
-            raise ValueError(f"epochs is {epochs}; give at least 1, the paper's best is 40 to 60")
-        if algorithm not in ("exact", "fast"):
-            raise ValueError(f"algorithm is {algorithm!r}; give 'exact' or 'fast'")
-        if seed < 0:
-            raise ValueError(f"seed is {seed}; give 0 or more")
-        if edge_metric not in ("3d", "image"):
-            raise ValueError(f"edge_metric is {edge_metric!r}; give '3d' or 'image'")
-        if not factor > 0:
-            raise ValueError(f"factor is {factor}; it must be positive, 1 is the mean edge")
-        self.nodes = nodes
-        self.epochs = epochs
-        self.algorithm = algorithm
-        self.seed = seed
-        self.edge_metric: EdgeMetric = edge_metric
-        self.factor = factor
-        self.threads = threads
-        self._live = BatchNeuralGas(nodes, seed, threads)
+    def __post_init__(self) -> None:
+        for good, name, allowed in (
+            (self.nodes >= 1, "nodes", "give at least 1, the paper takes 1400 to 2800"),
+            (self.epochs >= 1, "epochs", "give at least 1, the paper's best is 40 to 60"),
+            (self.algorithm in ("exact", "fast"), "algorithm", "give 'exact' or 'fast'"),
+            (self.seed >= 0, "seed", "give 0 or more"),
+        ):
+            if not good:
+                raise ValueError(f"{name} is {getattr(self, name)!r}; {allowed}")
+        check_edges(self.edge_metric, self.factor)
+        self._live = self._untrained()
         self._updating = threading.Lock()
 
     def select(self, samples: SeedGrid | Samples) -> RegionSelection:
@@ -112,9 +101,9 @@ class NeuralGasSelector:
             a camera nor metric points.
         """
         points, uv = _finite_points(samples), samples.uv
-        gas = BatchNeuralGas(self.nodes, self.seed, self.threads)
+        gas = self._untrained()
         if len(points) == 0:
-            return self._nothing(samples)
+            return self._regions(gas, samples)
         if self.algorithm == "fast":
             gas.train(points, uv)
         else:
@@ -137,16 +126,18 @@ class NeuralGasSelector:
         """
         points, uv = _finite_points(samples), samples.uv
         if len(points) == 0:
-            return self._nothing(samples)
+            return self._regions(self._untrained(), samples)
         if not self._updating.acquire(blocking=False):
             raise RuntimeError(
                 "another thread is updating this NeuralGasSelector; give each stream of frames a selector of its own"
             )
         try:
-            gas = self._live.update(points, uv)
-            return self._regions(gas, samples)
+            return self._regions(self._live.update(points, uv), samples)
         finally:
             self._updating.release()
+
+    def _untrained(self) -> BatchNeuralGas:
+        return BatchNeuralGas(self.nodes, self.seed, self.threads)
 
     def _regions(self, gas: BatchNeuralGas, samples: SeedGrid | Samples) -> RegionSelection:
         camera = samples.camera
@@ -158,15 +149,6 @@ class NeuralGasSelector:
             edge_metric=self.edge_metric,
             factor=self.factor,
             quantisation_error_mm=gas.quantisation_error_mm_,
-        )
-
-    def _nothing(self, samples: SeedGrid | Samples) -> RegionSelection:
-        return delaunay_regions(
-            np.zeros((0, 3), np.float32),
-            np.zeros((0, 2), np.float32),
-            samples.frame_shape,
-            edge_metric=self.edge_metric,
-            factor=self.factor,
         )
 
 

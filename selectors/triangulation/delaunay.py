@@ -149,14 +149,8 @@ def _first_triangle(uv: Ints, n: int, tri: Ints, adj: Ints) -> int:
     a, b, c = 0, 1, third
     if _orient(uv, a, b, c) < 0:
         a, b = b, a
-    tri[0, 0], tri[0, 1], tri[0, 2] = a, b, c
-    tri[1, 0], tri[1, 1], tri[1, 2] = c, b, GHOST
-    tri[2, 0], tri[2, 1], tri[2, 2] = a, c, GHOST
-    tri[3, 0], tri[3, 1], tri[3, 2] = b, a, GHOST
-    adj[0, 0], adj[0, 1], adj[0, 2] = 1, 2, 3
-    adj[1, 0], adj[1, 1], adj[1, 2] = 3, 2, 0
-    adj[2, 0], adj[2, 1], adj[2, 2] = 1, 3, 0
-    adj[3, 0], adj[3, 1], adj[3, 2] = 2, 1, 0
+    tri[:4] = np.array(((a, b, c), (c, b, GHOST), (a, c, GHOST), (b, a, GHOST)))
+    adj[:4] = np.array(((1, 2, 3), (3, 2, 0), (1, 3, 0), (2, 1, 0)))
     return third
 
 
@@ -265,33 +259,19 @@ class Mesh:
         tri[:count] = names[tri[:count]]
         return cls(points, tri, adj, bins, bin_px, changed, n, count)
 
-    def copy(self, capacity: int = 0) -> Mesh:
-        """An independent copy with room for `capacity` points."""
-        capacity = max(capacity, self.points)
-        copy = Mesh(
-            np.zeros((capacity, 2), np.int32),
-            np.empty((2 * capacity, 3), np.int32),
-            np.empty((2 * capacity, 3), np.int32),
-            self.bins.copy(),
-            self.bin_px,
-            np.ones(2 * capacity, np.bool_),
-            self.points,
-            self.triangles,
-        )
-        copy.uv[: self.points] = self.uv[: self.points]
-        copy.tri[: self.triangles] = self.tri[: self.triangles]
-        copy.adj[: self.triangles] = self.adj[: self.triangles]
-        return copy
-
     def add(self, uv: npt.NDArray[np.integer]) -> None:
         """Add points that are not in the mesh yet and lie within the extent it was made for.
 
         Parameters
         ----------
         uv : int array of shape (n, 2)
-            Pixels, column first. There must be room for them.
+            Pixels, column first.
         """
         end = self.points + len(uv)
+        if end > len(self.uv):  # more room, for as many again
+            self.uv = np.pad(self.uv, ((0, end), (0, 0)))
+            self.tri, self.adj = (np.pad(rows, ((0, 2 * end), (0, 0))) for rows in (self.tri, self.adj))
+            self.changed = np.pad(self.changed, (0, 2 * end))
         self.uv[self.points : end] = uv
         self.triangles = _insert_all(
             self.uv, self.points, end, -1, self.tri, self.adj, self.triangles, self.bins, self.bin_px, self.changed

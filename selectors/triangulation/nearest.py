@@ -15,7 +15,7 @@ _FAR = 1 << 20  # farther than any row of any image, and its square fits in 64 b
 
 
 @njit(cache=True, nogil=True)
-def _nearest_row_in_column(valid: Bools, nearest_row: Ints, first: int, end: int) -> None:
+def _nearest_row_in_column(first: int, end: int, valid: Bools, nearest_row: Ints) -> None:
     """Per pixel of the columns first..end, the nearest row of its column with a sample."""
     height = valid.shape[0]
     for u in range(first, end):
@@ -33,7 +33,7 @@ def _nearest_row_in_column(valid: Bools, nearest_row: Ints, first: int, end: int
 
 
 @njit(cache=True, nogil=True)
-def _nearest_along_rows(nearest_row: Ints, nearest: Ints, gap_sq: Ints, first: int, end: int) -> None:
+def _nearest_along_rows(first: int, end: int, nearest_row: Ints, nearest: Ints, gap_sq: Ints) -> None:
     """Lower envelope of the columns' parabolas, row by row: the exact nearest sample."""
     width = nearest_row.shape[1]
     column = np.empty(width, np.int64)  # of the parabolas on the envelope
@@ -99,6 +99,6 @@ def nearest_sample(valid: Bools, threads: int | None = None) -> tuple[Ints, Ints
     height, width = valid.shape
     nearest_row = np.empty((height, width), np.int32)
     nearest, gap_sq = np.empty((height, width), np.int32), np.empty((height, width), np.int32)
-    in_bands(lambda first, end: _nearest_row_in_column(valid, nearest_row, first, end), width, threads)
-    in_bands(lambda first, end: _nearest_along_rows(nearest_row, nearest, gap_sq, first, end), height, threads)
+    in_bands(_nearest_row_in_column, width, threads, valid, nearest_row)
+    in_bands(_nearest_along_rows, height, threads, nearest_row, nearest, gap_sq)
     return nearest, gap_sq

@@ -119,17 +119,17 @@ def _claim(layers: Layers, uv: Ints) -> None:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _bridges(uv: Ints, z_mm: Floats, corners: Ints, step_mm: float, bridge_px: float) -> bool:
+def _bridges(uv: Ints, z_mm: Floats, corners: Ints) -> bool:
     """Whether a triangle of three points spans a hole or a depth step."""
     a, b, c = corners[0], corners[1], corners[2]
-    if max(z_mm[a], z_mm[b], z_mm[c]) - min(z_mm[a], z_mm[b], z_mm[c]) <= step_mm:
+    if max(z_mm[a], z_mm[b], z_mm[c]) - min(z_mm[a], z_mm[b], z_mm[c]) <= STEP_MM:
         return False
     longest = max(
         (uv[a, 0] - uv[b, 0]) ** 2 + (uv[a, 1] - uv[b, 1]) ** 2,
         (uv[b, 0] - uv[c, 0]) ** 2 + (uv[b, 1] - uv[c, 1]) ** 2,
         (uv[c, 0] - uv[a, 0]) ** 2 + (uv[c, 1] - uv[a, 1]) ** 2,
     )
-    return bool(longest > bridge_px * bridge_px)
+    return bool(longest > BRIDGE_PX * BRIDGE_PX)
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
@@ -144,18 +144,15 @@ def _along_edge(uv: Ints, z_mm: Floats, corners: Ints, across: int, u: int, v: i
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(
-    layers: Layers, uv: Ints, z_mm: Floats, tri: Ints, adj: Ints, changed: Ints, limits: tuple[float, float]
-) -> None:
+def _draw(first: int, end: int, changed: Ints, layers: Layers, uv: Ints, z_mm: Floats, tri: Ints, adj: Ints) -> None:
     """Draw triangles into the model: those that bridge nothing linearly, the others not at all.
 
     Pixels on the edge that a bridge shares with a plain triangle are the plain one's, and a sample
     counts as plain. So whichever triangle is drawn last, the model is the same.
     """
     width = layers.depth_mm.shape[1]
-    step_mm, bridge_px = limits
     plain, owned = np.empty(3, np.bool_), np.empty(3, np.bool_)
-    for t in changed:
+    for t in changed[first:end]:
         a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
         u0, v0 = np.int64(uv[a, 0]), np.int64(uv[a, 1])
         u1, v1 = np.int64(uv[b, 0]), np.int64(uv[b, 1])
@@ -163,11 +160,11 @@ def _draw(
         z0, z1, z2 = z_mm[a], z_mm[b], z_mm[c]
         mean = (z0 + z1 + z2) / np.float32(3)
         spread = ((z0 - mean) ** 2 + (z1 - mean) ** 2 + (z2 - mean) ** 2) / np.float32(3)
-        bridge = _bridges(uv, z_mm, tri[t], step_mm, bridge_px)
+        bridge = _bridges(uv, z_mm, tri[t])
         for k in range(3):
             o = tri[adj[t, k]]
             hull = o[0] == GHOST or o[1] == GHOST or o[2] == GHOST
-            plain[k] = bridge and not hull and not _bridges(uv, z_mm, o, step_mm, bridge_px)
+            plain[k] = bridge and not hull and not _bridges(uv, z_mm, o)
             # Of two triangles, the edge's pixels are that one's which it bounds from above.
             begin, end = tri[t, (k + 1) % 3], tri[t, (k + 2) % 3]
             du, dv = uv[end, 0] - uv[begin, 0], uv[end, 1] - uv[begin, 1]
@@ -321,11 +318,6 @@ class Surface:
         if self._mesh is None:
             self._mesh = Mesh.of(self._uv, 2 * len(self._uv), layers.depth_mm.shape)
         else:
-            if len(self._uv) > len(self._mesh.uv):
-                changed = np.zeros(4 * len(self._uv), np.bool_)
-                changed[: len(self._mesh.changed)] = self._mesh.changed
-                self._mesh = self._mesh.copy(2 * len(self._uv))
-                self._mesh.changed[:] = changed
             self._mesh.add(uv)
 
     def _draw_changed(self) -> None:
@@ -337,11 +329,5 @@ class Surface:
         inside = (mesh.tri[changed] != GHOST).all(axis=1)
         mesh.changed[: mesh.triangles] = False
         drawn = changed[inside].astype(np.int32)
-        limits = (STEP_MM, BRIDGE_PX)
-
-        def draw(begin: int, end: int) -> None:
-            part = drawn[begin:end]
-            _draw(layers, mesh.uv, self._depth_mm, mesh.tri, mesh.adj, part, limits)
-
-        # Of few triangles, beginning threads would take longer.
-        in_bands(draw, len(drawn), self._threads if len(drawn) > MANY_TRIANGLES else 1)
+        threads = self._threads if len(drawn) > MANY_TRIANGLES else 1  # to begin some would take longer
+        in_bands(_draw, len(drawn), threads, drawn, layers, mesh.uv, self._depth_mm, mesh.tri, mesh.adj)

@@ -171,7 +171,7 @@ def test_winners_meet_the_slow_search(count, nodes, bin_px, equal, seed):
     rows = columns = int(40 // bin_px) + 1
     bins = fast._sort_into_bins(places, nodes_uv, bin_px, rows, columns)
     winner, d2 = np.empty(count, np.int32), np.empty((2, count), np.float32)
-    fast._find_two(points, uv, bin_px, rows, columns, *bins, winner, d2, 0, count)
+    fast._find_two(0, count, points, uv, bin_px, rows, columns, *bins, winner, d2)
     slow = winners_slowly(points, uv, places, nodes_uv, bin_px, rows, columns)
     assert np.allclose(d2[0], slow[:, 0], rtol=1e-4, atol=1e-3)
     some = np.isfinite(slow[:, 1])
