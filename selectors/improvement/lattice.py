@@ -41,7 +41,7 @@ def lattice_scratch(most_pixels: int) -> tuple[Floats, ...]:
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
-    padded, i, order, batch, geometry, up, down, left, right, tables, scratch, strip
+    padded, i, order, batch, geometry, sides, tables, scratch, strip
 ):
     """Krige the windows of lattice row `i` in batch number `batch`.
 
@@ -55,29 +55,26 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
         Lattice row.
     order : int64 array of shape (batches, LANES)
         Lattice column in each lane.
-    geometry, up, down, left, right : int
-        The windows' geometry: its number in the tables, and itself.
-    tables : tuple
-        `LatticeTables.arrays`.
+    geometry : int
+        The windows' number in the tables.
+    sides : tuple of int
+        How far they reach up, down, left and right.
+    tables : LatticeTables
+        Of all geometries.
     scratch : tuple
         `lattice_scratch`.
     strip : float32 array of shape (3, rows, columns, places or more)
         Filled with estimate, variance and improvement, this batch from place batch * LANES on.
     """
-    (
-        first_pixel, first_pair, _, _, vectors, is_seed, products, bases, basis, eigenvalues,
-        distance_sums, moments,
-    ) = tables  # fmt: skip
+    vectors, is_seed, products, bases = tables.vectors, tables.is_seed, tables.products, tables.bases
     s, inverse, covariance = scratch
-    _fit_lanes(
-        padded, i, order, batch, basis[geometry], eigenvalues[geometry], distance_sums[geometry],
-        moments[geometry], s,
-    )  # fmt: skip
+    _fit_lanes(padded, i, order, batch, tables, geometry, s)
 
+    up, down, left, right = sides
     height, width = up + down - 1, left + right - 1
     stride = width + 2
     first, end = batch * LANES, (batch + 1) * LANES
-    pixel = first_pixel[geometry]
+    pixel = tables.first_pixel[geometry]
     for p in range((height + 2) * stride):
         if is_seed[pixel + p]:
             for n in range(LANES):
@@ -95,7 +92,7 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
     inside = height * width
     across, down_from = inside, inside + height * (width + 1)
     pairs = down_from + (height + 1) * width
-    pair = first_pair[geometry]
+    pair = tables.first_pair[geometry]
     for k in range(pairs):
         g = products[pair + k]
         base = bases[pair + k]
@@ -146,9 +143,11 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _fit_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
-    padded, i, order, batch, basis, eigenvalues, distance_sums, moments, s
+    padded, i, order, batch, tables, geometry, s
 ):
     """Gather the depths, fit (a, b) and weigh the contrasts of each lane."""
+    basis, eigenvalues = tables.basis[geometry], tables.eigenvalues[geometry]
+    distance_sums, moments = tables.distance_sums[geometry], tables.moments[geometry]
     for n in range(LANES):
         j = order[batch, n]
         centre = padded[i + 1, j + 1]

@@ -24,7 +24,7 @@ semivariogram come out of y as well: with x = Z - mean Z,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -38,8 +38,7 @@ CONTRASTS = SEEDS - 1
 """Dimensions of a window's system once the mean is taken out."""
 
 
-@dataclass(frozen=True, eq=False)
-class LatticeTables:
+class LatticeTables(NamedTuple):
     """Tables of all window geometries, one after the other.
 
     Pixels of a window are numbered row by row with a rim of one pixel on every side; pairs are
@@ -85,18 +84,10 @@ class LatticeTables:
     distance_sums: Floats
     moments: Floats
 
-    def arrays(self) -> tuple[npt.NDArray[np.generic], ...]:
-        """Everything, in order, as the kernels take it."""
-        return (
-            self.first_pixel, self.first_pair, self.distances, self.between, self.vectors,
-            self.is_seed, self.products, self.bases, self.basis, self.eigenvalues,
-            self.distance_sums, self.moments,
-        )  # fmt: skip
-
     @property
     def bytes(self) -> int:
         """Memory that the tables take."""
-        return sum(array.nbytes for array in self.arrays())
+        return sum(array.nbytes for array in self)
 
 
 def build_tables(geometries: list[tuple[int, int, int, int]], exponent: float) -> LatticeTables:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Bytes, Floats
 from selective_depth.selectors.improvement.lattice import LANES, krige_lanes
 from selective_depth.selectors.improvement.lattice_tables import SEEDS
+from selective_depth.selectors.improvement.neighbourhoods import Windows
 from selective_depth.selectors.improvement.systems import Box, krige_window
 from selective_depth.selectors.improvement.variogram import fit_samples
 
@@ -50,26 +52,29 @@ def gather_seeds(padded, rows, columns, i, j, samples):  # type: ignore[no-untyp
 
 @njit(cache=True, nogil=True)
 def krige_row(  # type: ignore[no-untyped-def]
-    i, padded, row_axis, column_axis, order, tables, frame_shape, samples, lattice_scratch,
-    window_scratch, strip, held,
-):  # fmt: skip
+    i, padded, lattice, frame_shape, scratch, strip, held
+):
     """Krige all windows of one lattice row.
 
     Parameters
     ----------
+    lattice : tuple
+        `Windows.kernel_arguments`.
+    scratch : tuple
+        `sample_buffers`, `lattice_scratch` and `window_scratch`.
     strip : float32 array of shape (3, rows of a window, columns of a window, places or more)
         Filled with estimate, variance and improvement of each window's pixels.
     held : float32 array of shape (places,)
         Filled with the number of samples that each window holds, 0 if it has no system.
     """
-    rows, ups, downs, row_shapes = row_axis
-    columns, lefts, rights, column_shapes = column_axis
+    row_axis, column_axis, order, _, tables, _ = lattice
+    samples, lattice_scratch, window_scratch = scratch
+    estimate, variance, improvement = window_scratch[:3]
+    rows, columns, lefts, rights = row_axis.centres, column_axis.centres, column_axis.before, column_axis.after
     lanes_columns, shape_of, place = order
-    first_pixel, distances, between = tables[0], tables[2], tables[3]
-    column_shape_count = len(first_pixel) // (row_shapes.max() + 1)
-    up, down = ups[i], downs[i]
+    up, down = row_axis.before[i], row_axis.after[i]
     height = up + down - 1
-    z, row_of = samples[2], samples[3]
+    first_geometry = row_axis.shape_of[i] * len(column_axis.shapes)
     for j in range(len(columns)):
         count = 0
         for k in range(3):
@@ -80,11 +85,9 @@ def krige_row(  # type: ignore[no-untyped-def]
     for batch in range(len(shape_of)):
         if held[batch * LANES : (batch + 1) * LANES].max() == SEEDS:
             j = lanes_columns[batch, 0]
-            geometry = row_shapes[i] * column_shape_count + shape_of[batch]
-            krige_lanes(
-                padded, i, lanes_columns, batch, geometry, up, down, lefts[j], rights[j], tables,
-                lattice_scratch, strip,
-            )  # fmt: skip
+            geometry = first_geometry + shape_of[batch]
+            sides = up, down, lefts[j], rights[j]
+            krige_lanes(padded, i, lanes_columns, batch, geometry, sides, tables, lattice_scratch, strip)
     for j in range(len(columns)):
         at = place[j]
         # What counts nothing need not be right: it is finite, by `krige_lanes` or from before.
@@ -92,19 +95,17 @@ def krige_row(  # type: ignore[no-untyped-def]
             continue
         width = lefts[j] + rights[j] - 1
         gathered = gather_seeds(padded, rows, columns, i, j, samples)
-        geometry = row_shapes[i] * column_shape_count + column_shapes[j]
-        a, b = fit_samples(z, row_of, gathered, between[geometry])
+        geometry = first_geometry + column_axis.shape_of[j]
+        between, first = tables.between[geometry], tables.first_pixel[geometry]
+        a, b = fit_samples(samples[2], samples[3], gathered, between)
         box = Box(columns[j] - lefts[j] + 1, rows[i] - up + 1, width, height)
-        krige_window(
-            samples, gathered, a, b, between[geometry], distances, first_pixel[geometry], box,
-            frame_shape, window_scratch, False,
-        )  # fmt: skip
+        krige_window(samples, gathered, a, b, between, tables.distances, first, box, frame_shape, window_scratch, False)
         for row in range(height):
             for column in range(width):
                 p = (row + 1) * (width + 2) + column + 1
-                strip[0, row, column, at] = window_scratch[0][p]
-                strip[1, row, column, at] = window_scratch[1][p]
-                strip[2, row, column, at] = window_scratch[2][p]
+                strip[0, row, column, at] = estimate[p]
+                strip[1, row, column, at] = variance[p]
+                strip[2, row, column, at] = improvement[p]
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -131,9 +132,9 @@ def blend_down(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def blend_across(column_blend, places, mixed, held, estimate, variance, raw):  # type: ignore[no-untyped-def]
+def blend_across(columns, places, mixed, held, estimate, variance, raw):  # type: ignore[no-untyped-def]
     """Blend one pixel row across from the windows left and right of each pixel."""
-    _, _, _, _, first_weight, second_weight = column_blend
+    first_weight, second_weight = columns.first_weight, columns.second_weight
     first_place, second_place, first_cell, second_cell = places
     flat_estimate, flat_variance, flat_raw = mixed[0].ravel(), mixed[1].ravel(), mixed[2].ravel()
     for x in range(len(estimate)):
@@ -147,39 +148,24 @@ def blend_across(column_blend, places, mixed, held, estimate, variance, raw):  #
         raw[x] = one * flat_raw[j] + other * flat_raw[k]
 
 
-FAR, MIXED = 0, 1
+def doubtful_cells(padded: Floats, windows: Windows) -> Bytes:
+    """Cells between lattice points that are not known as a whole: 1, or 2 where nothing is near.
 
-
-@njit(cache=True, forceinline=True, nogil=True)
-def judge_cells(i, padded, rows, columns, reach_squared, doubtful):  # type: ignore[no-untyped-def]
-    """List the cells between lattice rows i and i + 1 that are not known as a whole.
-
-    Cell j lies between lattice columns j - 1 and j. A seed that returned depth makes known
-    what lies within reach of it; seeds two lattice steps away or farther are not asked.
-    `doubtful` is filled with the numbers of the cells, and with FAR where nothing in them is
-    known or MIXED where each pixel is to be looked at; returned is how many they are.
+    A seed that returned depth makes known what lies within reach of it; seeds two lattice steps
+    away or farther are not asked. Shape (R + 1, C + 1), with the cells at the frame's edge.
     """
-    found = 0
-    height = rows[i + 1] - rows[i] if 0 <= i < len(rows) - 1 else -1
-    for j in range(len(columns) + 1):
-        width = columns[j] - columns[j - 1] if 0 < j < len(columns) else -1
-        # At the frame's edge a cell has no far side: look at its pixels one by one.
-        small = height >= 0 and width >= 0 and height**2 + width**2 <= reach_squared
-        corners = 0
-        for k in range(4):
-            corners += padded[i + 1 + k // 2, j + k % 2] > 0
-        # Every window that a pixel here lies in holds all corners; a system takes two samples.
-        if corners >= 2 and small:
-            continue
-        state = MIXED
-        if corners == 0:
-            top, bottom = max(i, 0), min(i + 4, padded.shape[0])
-            start, end = max(j - 1, 0), min(j + 3, padded.shape[1])
-            if not (padded[top:bottom, start:end] > 0).any():
-                state = FAR
-        doubtful[0, found], doubtful[1, found] = j, state
-        found += 1
-    return found
+    measured = (padded > 0).astype(np.uint8)
+    corners = measured[:-1, :-1] + measured[1:, :-1] + measured[:-1, 1:] + measured[1:, 1:]
+    # At the frame's edge a cell has no far side: its pixels are looked at one by one.
+    down, across = (
+        np.pad(np.diff(axis.centres) ** 2.0, 1, constant_values=np.inf) for axis in (windows.rows, windows.columns)
+    )
+    small = down[:, None] + across <= windows.reach_px**2
+    beside = np.pad(corners, 1)
+    beside = beside[:-2] | beside[1:-1] | beside[2:]
+    near = (beside[:, :-2] | beside[:, 1:-1] | beside[:, 2:]) > 0
+    # Every window that a pixel here lies in holds all corners; a system takes two samples.
+    return np.where((corners >= 2) & small, 0, np.where(near, 1, 2)).astype(np.uint8)
 
 
 @njit(cache=True, forceinline=True, nogil=True)
@@ -195,25 +181,25 @@ def near_seed(padded, rows, columns, i, j, y, x, reach_squared):  # type: ignore
 
 
 @njit(cache=True, forceinline=True, nogil=True)
-def mark_known(  # type: ignore[no-untyped-def]
-    y, i, padded, rows, columns, column_blend, places, reach_squared, held, doubtful, line
-):
-    """Tell known pixels of a row from those too far from every seed, and clear the latter.
+def mark_known(y, padded, doubtful, lattice, held, line):  # type: ignore[no-untyped-def]
+    """Tell known pixels of row y from those too far from every seed, and clear the latter.
 
-    `line` is the pixel row y of the estimate, the variance, the improvement and what is known.
+    `line` is the pixel row of the estimate, the variance, the improvement and what is known.
     """
+    row_axis, column_axis, _, places, _, reach_squared = lattice
+    rows, columns = row_axis.centres, column_axis.centres
+    first_weight, second_weight = column_axis.first_weight, column_axis.second_weight
+    first_place, second_place, _, _ = places
     estimate, variance, raw, known = line
-    _, _, _, _, first_weight, second_weight = column_blend
-    first_place, second_place = places[0], places[1]
+    i = row_axis.first[y] if rows[0] <= y else -1
     known[:] = True
-    for n in range(doubtful.shape[1]):
-        j, state = doubtful[0, n], doubtful[1, n]
-        start = columns[j - 1] if j > 0 else 0
-        end = columns[j] if j < len(columns) else len(known)
-        for x in range(start, end):
-            if state == MIXED:
-                total = first_weight[x] * held[first_place[x]]
-                total += second_weight[x] * held[second_place[x]]
+    for j in range(len(columns) + 1):
+        doubt = doubtful[i + 1, j]
+        if doubt == 0:
+            continue
+        for x in range(columns[j - 1] if j > 0 else 0, columns[j] if j < len(columns) else len(known)):
+            if doubt == 1:
+                total = first_weight[x] * held[first_place[x]] + second_weight[x] * held[second_place[x]]
                 if total > 0 and near_seed(padded, rows, columns, i, j, y, x, reach_squared):
                     continue
             known[x] = False
@@ -224,7 +210,7 @@ def mark_known(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def improvement_rows(  # type: ignore[no-untyped-def]
-    first_row, end_row, padded, half, lattice, scratch, histogram, out
+    first_row, end_row, padded, doubtful, half, lattice, scratch, histogram, maps, known
 ):
     """Map the pixel rows `first_row` to `end_row` - 1 of a frame.
 
@@ -232,6 +218,8 @@ def improvement_rows(  # type: ignore[no-untyped-def]
     ----------
     padded : float32 array of shape (R + 2, C + 2)
         Depth of the seeds, 0 = missing, with a rim of zeros.
+    doubtful : uint8 array of shape (R + 1, C + 1)
+        `doubtful_cells`.
     half : float32
         The improvement that scores one half.
     lattice : tuple
@@ -240,40 +228,28 @@ def improvement_rows(  # type: ignore[no-untyped-def]
         Working memory of this band.
     histogram : int32 array of shape (2, LEVELS)
         Number of pixels by the upper bits of their improvement, in two parts.
-    out : tuple
-        Estimate, variance, improvement, score and known of the frame.
+    maps : float32 array of shape (4, H, W)
+        Estimate, variance, improvement and score of the frame, filled in.
+    known : bool array of shape (H, W)
+        Likewise.
     """
-    row_axis, column_axis, row_blend, column_blend, order, places, tables, reach_squared = lattice
-    estimate, variance, raw, score, known = out
-    samples, lattice_scratch, window_scratch, strips, helds, mixed, held, doubtful = scratch
-    frame_shape = estimate.shape
-    rows, columns = row_axis[0], column_axis[0]
-    y_first, y_second, y_first_at, y_second_at, y_first_weight, y_second_weight = row_blend
+    axis, columns, places = lattice[0], lattice[1], lattice[3]
+    estimate, variance, raw, score = maps[0], maps[1], maps[2], maps[3]
+    kriging, strips, helds, mixed, held = scratch
+    frame_shape = known.shape
     ready = -1
-    judged = -2
-    doubts = 0
     for y in range(first_row, end_row):
-        i, k = y_first[y], y_second[y]
+        i, k = axis.first[y], axis.second[y]
         # Lattice row n is kept in slot n % 2 as long as it is needed.
         for n in range(max(ready + 1, i), k + 1):
-            krige_row(
-                n, padded, row_axis, column_axis, order, tables, frame_shape, samples,
-                lattice_scratch, window_scratch, strips[n % 2], helds[n % 2],
-            )  # fmt: skip
+            krige_row(n, padded, lattice, frame_shape, kriging, strips[n % 2], helds[n % 2])
             ready = n
         blend_down(
-            y_first_weight[y], strips[i % 2], y_first_at[y], helds[i % 2],
-            y_second_weight[y], strips[k % 2], y_second_at[y], helds[k % 2], mixed, held,
+            axis.first_weight[y], strips[i % 2], axis.first_at[y], helds[i % 2],
+            axis.second_weight[y], strips[k % 2], axis.second_at[y], helds[k % 2], mixed, held,
         )  # fmt: skip
-        blend_across(column_blend, places, mixed, held[0], estimate[y], variance[y], raw[y])
-        above = i if rows[i] <= y else -1
-        if judged != above:
-            doubts = judge_cells(above, padded, rows, columns, reach_squared, doubtful)
-            judged = above
-        mark_known(
-            y, above, padded, rows, columns, column_blend, places, reach_squared, held[0],
-            doubtful[:, :doubts], (estimate[y], variance[y], raw[y], known[y]),
-        )  # fmt: skip
+        blend_across(columns, places, mixed, held[0], estimate[y], variance[y], raw[y])
+        mark_known(y, padded, doubtful, lattice, held[0], (estimate[y], variance[y], raw[y], known[y]))
         for x in range(frame_shape[1]):
             score[y, x] = raw[y, x] / (raw[y, x] + half)
         # Two counts in turn: neighbours are alike, and the same count twice is a wait.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,8 +33,7 @@ LONE_PITCH = 5.0
 """Pitch in pixels that a lattice of a single point is taken to have."""
 
 
-@dataclass(frozen=True, eq=False)
-class Axis:
+class Axis(NamedTuple):
     """The windows along one axis of the frame.
 
     Parameters
@@ -46,6 +45,10 @@ class Axis:
     before, after : int64 array of shape (n,)
         Distance from a centre to the one before and after it; at the ends to where a next
         centre would be, beyond the frame's edge if the known region gets that far.
+    shapes : int64 array of shape (k, 2)
+        The different (before, after).
+    shape_of : int64 array of shape (n,)
+        Which of them each window has.
     first, second : int64 array of shape (pixels,)
         The centres before (or at) and after each pixel; at the ends both are the outermost.
     first_at, second_at : int64 array of shape (pixels,)
@@ -58,6 +61,8 @@ class Axis:
     centres: Longs
     before: Longs
     after: Longs
+    shapes: Longs
+    shape_of: Longs
     first: Longs
     second: Longs
     first_at: Longs
@@ -65,23 +70,10 @@ class Axis:
     first_weight: Floats
     second_weight: Floats
 
-    @cached_property
-    def shapes(self) -> tuple[Longs, Longs]:
-        """The different (before, after), shape (k, 2), and which of them each window has."""
-        pairs = np.stack((self.before, self.after), axis=1)
-        different, which = np.unique(pairs, axis=0, return_inverse=True)
-        return different, which.ravel().astype(np.int64)
-
     @property
     def longest(self) -> int:
         """Farthest that any window reaches from its centre, pixels."""
         return int(max(self.before.max(), self.after.max()))
-
-    @property
-    def blend(self) -> tuple[npt.NDArray[np.generic], ...]:
-        """The last six, as the kernels take them."""
-        at = self.first, self.second, self.first_at, self.second_at
-        return *at, self.first_weight, self.second_weight
 
     @classmethod
     def of(cls, pixels: int, centres: npt.NDArray[np.integer], reach_px: float) -> Axis:
@@ -95,6 +87,7 @@ class Axis:
         end = max(int(gaps[-1]) if len(gaps) else 1, min(pixels - int(at[-1]), farthest))
         before = np.concatenate(([start], gaps))
         after = np.concatenate((gaps, [end]))
+        shapes, shape_of = np.unique(np.stack((before, after), axis=1), axis=0, return_inverse=True)
 
         x = np.arange(pixels)
         lower = np.searchsorted(at, x, side="right") - 1
@@ -108,6 +101,8 @@ class Axis:
             centres=at,
             before=before,
             after=after,
+            shapes=shapes,
+            shape_of=shape_of.ravel().astype(np.int64),
             first=first,
             second=second,
             first_at=np.where(covered, x - at[first] + before[first] - 1, 0),
@@ -143,11 +138,7 @@ class Windows:
     def tables(self) -> LatticeTables:
         """Tables of every geometry: row shape by row shape, column shapes within."""
         return build_tables(
-            [
-                (int(up), int(down), int(left), int(right))
-                for up, down in self.rows.shapes[0]
-                for left, right in self.columns.shapes[0]
-            ],
+            [(*rows, *columns) for rows in self.rows.shapes.tolist() for columns in self.columns.shapes.tolist()],
             self.exponent,
         )
 
@@ -165,11 +156,11 @@ class Windows:
         place : int64 array of shape (C,)
             Where each lattice column went: batch * LANES + lane.
         """
-        which = self.columns.shapes[1]
+        which = self.columns.shape_of
         batches: list[Longs] = []
         shape_of = []
         place = np.zeros(len(which), np.int64)
-        for shape in range(len(self.columns.shapes[0])):
+        for shape in range(len(self.columns.shapes)):
             members = np.flatnonzero(which == shape)
             place[members] = len(batches) * LANES + np.arange(len(members))
             for first in range(0, len(members), LANES):
@@ -180,23 +171,13 @@ class Windows:
 
     @cached_property
     def kernel_arguments(self) -> tuple[Any, ...]:
-        """Everything about the lattice that `improvement_kernel.improvement_rows` takes."""
-        rows, columns = self.rows, self.columns
-        lanes_columns, shape_of, place = self.order
-        places = lanes_columns.size
+        """Everything about the lattice that `improvement_rows` takes."""
+        columns, place, places = self.columns, self.order[2], self.order[0].size
         # Where each pixel's value is in a row of blended windows, flattened.
         first, second = place[columns.first], place[columns.second]
         cells = first + places * columns.first_at, second + places * columns.second_at
-        return (
-            (rows.centres, rows.before, rows.after, rows.shapes[1]),
-            (columns.centres, columns.before, columns.after, columns.shapes[1]),
-            rows.blend,
-            columns.blend,
-            (lanes_columns, shape_of, place),
-            tuple(index.astype(np.uint32) for index in (first, second, *cells)),
-            self.tables.arrays(),
-            self.reach_px**2,
-        )
+        at = tuple(index.astype(np.uint32) for index in (first, second, *cells))
+        return self.rows, columns, self.order, at, self.tables, self.reach_px**2
 
     @property
     def most_pixels(self) -> int:

@@ -7,8 +7,7 @@ a lattice alone that is the same system as `ImprovementSelector` solves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,8 +26,7 @@ MOST_EXPONENT = 1.9999
 """Nearer to 2 the kriging variance vanishes beside the rounding of single precision."""
 
 
-@dataclass(frozen=True, eq=False)
-class ImprovementMap:
+class ImprovementMap(NamedTuple):
     """Estimate, variance and improvement of a frame's pixels.
 
     Parameters
@@ -96,37 +94,12 @@ def improvement_scattered(
     return map_scattered(measured, asked, windows, threads, by_sums=by_sums)
 
 
-class _Work(NamedTuple):
-    """Working memory of a band of rows.
-
-    Attributes
-    ----------
-    samples : tuple
-        `sample_buffers`.
-    distances : float32 array of shape (MAX_SAMPLES, most pixels of a window)
-        Distance^w from each sample to the pixels of a window.
-    scratch : tuple
-        `window_scratch`.
-    sums : float32 array of shape (3, rows, W)
-        Estimate, variance and improvement, weighted and added up.
-    held : float32 array of shape (rows, W)
-        The weights.
-    """
-
-    samples: tuple[npt.NDArray[Any], ...]
-    distances: Floats
-    scratch: tuple[npt.NDArray[Any], ...]
-    sums: Floats
-    held: Floats
-
-
 def map_scattered(
     measured: Floats, asked: Bools | None, windows: Windows, threads: int | None, *, by_sums: bool = False
 ) -> ImprovementMap:
     """Map the improvement of an image of samples (mm, 0 = none) at the pixels asked for, or all."""
     asked = np.ones(measured.shape, np.bool_) if asked is None else asked
-    rows, columns = windows.rows, windows.columns
-    result = ImprovementMap(
+    maps = ImprovementMap(
         estimate_mm=np.full(measured.shape, np.nan, np.float32),
         variance_mm2=np.full(measured.shape, np.nan, np.float32),
         known=np.zeros(measured.shape, np.bool_),
@@ -135,23 +108,14 @@ def map_scattered(
     spiral = _spiral(windows.power.shape[0] // 2)
 
     def band(first_row: int, end_row: int) -> None:
-        work = _Work(
-            samples=sample_buffers(),
-            distances=np.zeros((MAX_SAMPLES, windows.most_pixels), np.float32),
-            scratch=window_scratch(windows.most_pixels),
-            sums=np.zeros((3, end_row - first_row, measured.shape[1]), np.float32),
-            held=np.zeros((end_row - first_row, measured.shape[1]), np.float32),
-        )
-        _map_rows(
-            first_row, end_row, measured, asked,
-            (rows.centres, rows.before, rows.after),
-            (columns.centres, columns.before, columns.after),
-            windows.power, spiral, windows.reach_px**2, by_sums, work,
-            (result.estimate_mm, result.variance_mm2, result.raw, result.known),
-        )  # fmt: skip
+        distances = np.zeros((MAX_SAMPLES, windows.most_pixels), np.float32)
+        sums = np.zeros((4, end_row - first_row, measured.shape[1]), np.float32)
+        scratch = sample_buffers(), distances, window_scratch(windows.most_pixels), sums
+        lattice = windows.rows, windows.columns, windows.power, spiral, windows.reach_px**2
+        _map_rows(first_row, end_row, measured, asked, lattice, by_sums, scratch, maps)
 
-    in_bands(band, measured.shape[0], threads)
-    return result
+    in_bands(band, len(measured), threads)
+    return maps
 
 
 def _spiral(reach: int) -> Longs:
@@ -199,19 +163,8 @@ def _near_sample(measured, spiral, y, x, reach_squared):  # type: ignore[no-unty
 
 @njit(cache=True, nogil=True)
 def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
-    first_row,
-    end_row,
-    measured,
-    asked,
-    row_axis,
-    column_axis,
-    power,
-    spiral,
-    reach_squared,
-    by_sums,
-    work,
-    out,
-):  # fmt: skip
+    first_row, end_row, measured, asked, lattice, by_sums, scratch, maps
+):
     """Map the rows first_row..end_row where asked, each window kriged and blended into its cells.
 
     Parameters
@@ -220,25 +173,24 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
         Depth of the samples in mm, 0 = none.
     asked : bool array of shape (H, W)
         Where the map is wanted.
-    row_axis, column_axis : tuple of int arrays
-        Centres of the windows, and how far each reaches before and after its centre, pixels.
-    power : float64 array of shape (2 r + 1, 2 r + 1)
-        Distance^w by difference of rows and columns.
-    spiral : int64 array of shape (n, 2)
-        Differences (row, column), the nearest first.
-    reach_squared : float
-        Pixels farther from every sample are not known, squared pixels.
+    lattice : tuple
+        The windows along the rows and the columns (`Axis`); distance^w by difference of rows and
+        columns; differences (row, column), the nearest first, int64 of shape (n, 2); how far from
+        every sample pixels are known, squared.
     by_sums : bool
         Take eq. (27) instead of eq. (23).
-    work : _Work
-        Working memory of this band.
-    out : tuple of arrays of shape (H, W)
-        Estimate (mm), variance (mm^2), improvement and known.
+    scratch : tuple
+        `sample_buffers`; distance^w from each sample to the pixels of a window, float32 of shape
+        (MAX_SAMPLES, most pixels of a window); `window_scratch`; zeros for the weighted sums and
+        the weights, float32 of shape (4, rows, W).
+    maps : ImprovementMap
+        Filled in where asked.
     """
-    rows, up, down = row_axis
-    columns, left, right = column_axis
-    samples, distances, scratch, sums, held = work
-    estimate, variance, raw, known = out
+    row_axis, column_axis, power, spiral, reach_squared = lattice
+    rows, up, down = row_axis.centres, row_axis.before, row_axis.after
+    columns, left, right = column_axis.centres, column_axis.before, column_axis.after
+    samples, distances, work, sums = scratch
+    estimate, variance, improvement = work[:3]
     u, v, z, row_of = samples
     between = np.zeros((MAX_SAMPLES, MAX_SAMPLES))
     reach = power.shape[0] // 2
@@ -270,7 +222,7 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
                         distances[n, p] = line[reach + x - u[n]]
                         p += 1
             box = Box(start, top, width, height)
-            krige_window(samples, count, a, b, between, distances, 0, box, measured.shape, scratch, by_sums)
+            krige_window(samples, count, a, b, between, distances, 0, box, measured.shape, work, by_sums)
             for y in range(y0, y1):
                 gap = up[i] if y < rows[i] else down[i]
                 share_y = count * (1.0 - abs(y - rows[i]) / gap)
@@ -278,15 +230,15 @@ def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
                     gap = left[j] if x < columns[j] else right[j]
                     share = np.float32(share_y * (1.0 - abs(x - columns[j]) / gap))
                     p = (y - top + 1) * (end - start + 2) + x - start + 1
-                    held[y - first_row, x] += share
-                    sums[0, y - first_row, x] += share * scratch[0][p]
-                    sums[1, y - first_row, x] += share * scratch[1][p]
-                    sums[2, y - first_row, x] += share * scratch[2][p]
+                    sums[0, y - first_row, x] += share * estimate[p]
+                    sums[1, y - first_row, x] += share * variance[p]
+                    sums[2, y - first_row, x] += share * improvement[p]
+                    sums[3, y - first_row, x] += share
     for y in range(first_row, end_row):
         for x in range(frame_width):
-            total = held[y - first_row, x]
+            total = sums[3, y - first_row, x]
             if asked[y, x] and total > 0 and _near_sample(measured, spiral, y, x, reach_squared):
-                known[y, x] = True
-                estimate[y, x] = sums[0, y - first_row, x] / total
-                variance[y, x] = sums[1, y - first_row, x] / total
-                raw[y, x] = sums[2, y - first_row, x] / total
+                maps.known[y, x] = True
+                maps.estimate_mm[y, x] = sums[0, y - first_row, x] / total
+                maps.variance_mm2[y, x] = sums[1, y - first_row, x] / total
+                maps.raw[y, x] = sums[2, y - first_row, x] / total

@@ -9,7 +9,8 @@ and `app/docs/improvement.md` for every choice that the paper leaves open.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -17,7 +18,13 @@ from scipy.ndimage import maximum_filter
 from selective_depth.selectors.arrays import Bools, Floats, Ints
 from selective_depth.selectors.choice import choose
 from selective_depth.selectors.improvement.lattice import lattice_scratch
-from selective_depth.selectors.improvement.map import LEVEL_SHIFT, LEVELS, best_threshold, improvement_rows
+from selective_depth.selectors.improvement.map import (
+    LEVEL_SHIFT,
+    LEVELS,
+    best_threshold,
+    doubtful_cells,
+    improvement_rows,
+)
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_of
 from selective_depth.selectors.improvement.scattered import EXPONENT, MOST_EXPONENT, ImprovementMap, map_scattered
 from selective_depth.selectors.improvement.systems import aligned_zeros, sample_buffers, window_scratch
@@ -58,6 +65,7 @@ class ImprovementSelection(Selection):
         return self.raw
 
 
+@dataclass(frozen=True)
 class ImprovementSelector:
     """Selects where a measurement would most improve the model of the scene.
 
@@ -79,22 +87,20 @@ class ImprovementSelector:
         If `share` or `exponent` is out of its range.
     """
 
+    share: float = 0.10
+    exponent: float = EXPONENT
+    threads: int | None = None
+    by_sums: bool = field(default=False, kw_only=True)
     name = "improvement"
 
-    def __init__(
-        self, share: float = 0.10, exponent: float = EXPONENT, threads: int | None = None, *, by_sums: bool = False
-    ) -> None:
-        if not 0 <= share <= 1:
-            raise ValueError(f"share is {share}; it is a part of all pixels, 0..1")
-        if not 0 < exponent <= MOST_EXPONENT:
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"share is {self.share}; it is a part of all pixels, 0..1")
+        if not 0 < self.exponent <= MOST_EXPONENT:
             raise ValueError(
-                f"exponent is {exponent}; give more than 0 and at most {MOST_EXPONENT} (w = 2 makes"
+                f"exponent is {self.exponent}; give more than 0 and at most {MOST_EXPONENT} (w = 2 makes"
                 " singular systems, and nearer to it single precision leaves only rounding)"
             )
-        self.share = share
-        self.exponent = exponent
-        self.threads = threads
-        self.by_sums = by_sums
 
     def select(self, samples: SeedGrid | Samples) -> ImprovementSelection:
         """Map the improvement over the whole frame and select its best pixels.
@@ -107,39 +113,23 @@ class ImprovementSelector:
         """
         if isinstance(samples, Samples) or self.by_sums:
             return self._select_scattered(Samples.of(samples))
-        seeds = samples
-        windows = windows_of(seeds, self.exponent)
-        shape = seeds.frame_shape
+        windows = windows_of(samples, self.exponent)
         # One block: the allocator keeps it for the next frame instead of returning its pages.
-        maps = np.empty((4, *shape), np.float32)
-        estimate, variance, raw, score = maps
-        known = np.empty(shape, np.bool_)
-        padded = np.zeros((seeds.shape[0] + 2, seeds.shape[1] + 2), np.float32)
-        padded[1:-1, 1:-1] = seeds.depth_mm
-        measured = np.count_nonzero(padded)
-        half = np.float32(HALF_SCORE * padded.sum(dtype=np.float64) / measured if measured else 1.0)
+        maps, known = np.empty((4, *samples.frame_shape), np.float32), np.empty(samples.frame_shape, np.bool_)
+        padded = np.pad(samples.depth_mm, 1)
+        doubtful = doubtful_cells(padded, windows)
+        half = _half(samples.depth_mm[samples.valid])
         histograms: list[Ints] = []
 
         def band(first_row: int, end_row: int) -> None:
             histogram = np.zeros((2, LEVELS), np.int32)
             histograms.extend(histogram)
-            improvement_rows(
-                first_row, end_row, padded, half, windows.kernel_arguments, _scratch(windows),
-                histogram, (estimate, variance, raw, score, known),
-            )  # fmt: skip
+            lattice, scratch = windows.kernel_arguments, _scratch(windows)
+            improvement_rows(first_row, end_row, padded, doubtful, half, lattice, scratch, histogram, maps, known)
 
-        in_bands(band, shape[0], self.threads)
-        wanted = int(self.share * np.count_nonzero(known))
-        threshold = best_threshold(raw.ravel(), sum(histograms), wanted)
-        return ImprovementSelection(
-            mask=raw >= threshold,
-            score=score,
-            name=self.name,
-            estimate_mm=estimate,
-            variance_mm2=variance,
-            known=known,
-            raw=raw,
-        )
+        in_bands(band, len(known), self.threads)
+        estimate, variance, raw, score = maps
+        return self._best_of(ImprovementMap(estimate, variance, known, raw), score, sum(histograms))
 
     def plan(self, samples: Samples) -> ImprovementPlan:
         """Begin an acquisition: after each round the map is made again where that changed it."""
@@ -152,19 +142,19 @@ class ImprovementSelector:
 
     def _select_scattered(self, samples: Samples) -> ImprovementSelection:
         found = self._map(samples)
-        raw = found.raw
+        levels = np.bincount(found.raw.view(np.uint32).ravel() >> LEVEL_SHIFT, minlength=LEVELS)
+        return self._best_of(found, found.raw / (found.raw + _half(samples.depth_mm)), levels)
+
+    def _best_of(self, found: ImprovementMap, score: Floats, levels: object) -> ImprovementSelection:
+        """The selection of a map, its mask the best `share` of what is known."""
         wanted = int(self.share * np.count_nonzero(found.known))
-        half = np.float32(HALF_SCORE * samples.depth_mm.mean() if len(samples.uv) else 1.0)
-        levels = np.bincount(raw.view(np.uint32).ravel() >> LEVEL_SHIFT, minlength=LEVELS)
-        return ImprovementSelection(
-            mask=raw >= best_threshold(raw.ravel(), levels, wanted),
-            score=raw / (raw + half),
-            name=self.name,
-            estimate_mm=found.estimate_mm,
-            variance_mm2=found.variance_mm2,
-            known=found.known,
-            raw=raw,
-        )
+        mask = found.raw >= best_threshold(found.raw.ravel(), levels, wanted)
+        return ImprovementSelection(mask, score, self.name, *found)
+
+
+def _half(depth_mm: Floats) -> np.float32:
+    """The improvement that scores one half, of samples of these depths."""
+    return np.float32(HALF_SCORE * depth_mm.mean(dtype=np.float64) if depth_mm.size else 1.0)
 
 
 class ImprovementPlan:
@@ -182,11 +172,11 @@ class ImprovementPlan:
     def best(self, shots: int) -> Ints:
         """The `shots` pixels whose measurement improves most, near some return."""
         samples, rule = self._samples, self._rule
-        changed = np.zeros(samples.frame_shape, np.bool_)
-        added = [uv for uv, depth_mm in samples.added_since(self._seen)]
+        added = [uv for uv, _ in samples.added_since(self._seen)]
         if added:
             windows = windows_of(samples.seeds, rule.exponent)
             new = np.concatenate(added)
+            changed = np.zeros(samples.frame_shape, np.bool_)
             changed[new[:, 1], new[:, 0]] = True
             # From one end of a window, rim included, to the pixel before the other.
             sides = [4 * axis.longest - 1 for axis in (windows.rows, windows.columns)]
@@ -196,38 +186,23 @@ class ImprovementPlan:
         return choose(np.where(samples.open(), self._raw, 0), shots, threads=rule.threads)
 
 
-class _Kept(threading.local):
-    """The working memory that a thread used last: frame after frame has the same lattice."""
-
-    windows: Windows | None = None
-    scratch: tuple[object, ...] = ()
+_kept = threading.local()
+"""The working memory that a thread used last: frame after frame has the same lattice."""
 
 
-_kept = _Kept()
-
-
-def _scratch(windows: Windows) -> tuple[object, ...]:
+def _scratch(windows: Windows) -> Any:
     """Working memory of `improvement_rows` for the calling thread."""
-    if _kept.windows is not windows:
-        _kept.scratch = _new_scratch(windows)
+    if getattr(_kept, "windows", None) is not windows:
+        tallest, widest = (int((axis.before + axis.after).max()) - 1 for axis in (windows.rows, windows.columns))
+        places, most = windows.order[0].size, windows.most_pixels
         _kept.windows = windows
+        _kept.scratch = (
+            (sample_buffers(), lattice_scratch(most), window_scratch(most)),
+            # A cache line more than needed: at a power of two, one lane's pixels would all be kept
+            # in the same few places of the cache.
+            aligned_zeros(2, 3, tallest, widest, places + 16),
+            aligned_zeros(2, places),
+            aligned_zeros(3, widest, places),
+            aligned_zeros(3, places),
+        )
     return _kept.scratch
-
-
-def _new_scratch(windows: Windows) -> tuple[object, ...]:
-    rows, columns = windows.rows, windows.columns
-    tallest = int((rows.before + rows.after).max()) - 1
-    widest = int((columns.before + columns.after).max()) - 1
-    places = windows.order[0].size
-    return (
-        sample_buffers(),
-        lattice_scratch(windows.most_pixels),
-        window_scratch(windows.most_pixels),
-        # A cache line more than needed: at a power of two, one lane's pixels would all be kept
-        # in the same few places of the cache.
-        aligned_zeros(2, 3, tallest, widest, places + 16),
-        aligned_zeros(2, places),
-        aligned_zeros(3, widest, places),
-        aligned_zeros(3, places),
-        np.zeros((2, len(columns.centres) + 1), np.int64),
-    )
