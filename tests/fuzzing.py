@@ -325,8 +325,8 @@ def try_one(target: Target, files: Files, folder: Path) -> str:
     return "read"
 
 
-def seeds_tried(name: str, first: int, until_s: float) -> Iterator[tuple[int, str]]:
-    """Try one input after the other in this process; each with what became of it."""
+def seeds_tried(name: str, first: int, until_s: float) -> Iterator[tuple[int, str, bool]]:
+    """Try one input after the other: its seed, what became of it, whether a library may print: libtiff does."""
     target = TARGETS[name]
     inputs, seed = target.make(), first
     for files in inputs:
@@ -335,7 +335,8 @@ def seeds_tried(name: str, first: int, until_s: float) -> Iterator[tuple[int, st
     while time.monotonic() < until_s:
         with tempfile.TemporaryDirectory() as folder:
             signal.setitimer(signal.ITIMER_PROF, HANG_S)
-            yield seed, try_one(target, damaged(inputs, seed), Path(folder))
+            files = damaged(inputs, seed)
+            yield seed, try_one(target, files, Path(folder)), any(name.endswith(".tiff") for name in files)
             signal.setitimer(signal.ITIMER_PROF, 0)
         seed += 1
 
@@ -353,7 +354,7 @@ def _work(name: str, first: int, minutes: float, note: Path) -> int:
     with tempfile.TemporaryFile() as said:
         os.dup2(said.fileno(), 2)
     try:
-        for seed, outcome in seeds_tried(name, first, time.monotonic() + 60 * minutes):
+        for seed, outcome, may_print in seeds_tried(name, first, time.monotonic() + 60 * minutes):
             counts[outcome] += 1
             note.write_text(str(seed + 1))
             lines = os.pread(2, 1000, 0).decode(errors="replace").splitlines()

@@ -8,11 +8,11 @@ import platform
 import tempfile
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -51,21 +51,9 @@ class BenchReport:
 
     def to_json(self) -> str:
         """The report as JSON: milliseconds per stage, seconds per peer."""
-        stages = {
-            name: {"p50_ms": each.p50_ms, "p99_ms": each.p99_ms, "max_ms": each.max_ms}
-            for name, each in self.stages.items()
-        }
-        content: dict[str, Any] = {
-            "source": self.source,
-            "frames": self.frames,
-            "dropped": self.dropped,
-            "fps": self.fps,
-            "threads": self.threads,
-            "machine": self.machine,
-            "stages": stages,
-            "peers": self.peers,
-            "ratios": ratios(self),
-        }
+        content = asdict(self) | {"ratios": ratios(self)}
+        for summary in content["stages"].values():
+            del summary["count"]
         return json.dumps(content, indent=2) + "\n"
 
 
@@ -143,15 +131,10 @@ def bench(source: str, frames: int | None = None, *, peers: bool = True, say: Sa
 
 
 def _seeds_of(source: str, frames: int | None) -> list[SeedGrid]:
-    seeds = []
     with open_and_tell(source) as opened:
         if opened.frame_count is None and frames is None:
             raise UsageError(f"'{source}' never ends; say how many frames to time, as in --frames 300.")
-        for frame in opened:
-            seeds.append(SeedGrid.from_frame(frame))
-            if frames is not None and len(seeds) >= frames:
-                break
-    return seeds
+        return [SeedGrid.from_frame(frame) for frame in islice(opened, frames)]
 
 
 def _timed(durations: Durations, name: str, calls: Iterable[Callable[[], object]]) -> None:
@@ -174,18 +157,14 @@ def _time_neural_gas(seeds: list[SeedGrid], durations: Durations, say: Say) -> N
     say("neural gas, exact")
     some = seeds[:: max(1, len(seeds) // EXACT_FRAMES)][:EXACT_FRAMES]
     train_exact(some[0].points_mm[:64], 16, 1, seed=0)  # compiles
-    _timed(
-        durations, "neural_gas_exact", (partial(train_exact, grid.points_mm, NODES, EPOCHS, seed=0) for grid in some)
-    )
+    exact = (partial(train_exact, grid.points_mm, NODES, EPOCHS, seed=0) for grid in some)
+    _timed(durations, "neural_gas_exact", exact)
     say("neural gas, fast and live")
     live = BatchNeuralGas(NODES, seed=0)
     live.train(seeds[0].points_mm, seeds[0].uv)
     cold = seeds[:: max(1, len(seeds) // COLD_FRAMES)][:COLD_FRAMES]
-    _timed(
-        durations,
-        "neural_gas_fast",
-        (partial(BatchNeuralGas(NODES, seed=0).train, grid.points_mm, grid.uv) for grid in cold),
-    )
+    fast = (partial(BatchNeuralGas(NODES, seed=0).train, grid.points_mm, grid.uv) for grid in cold)
+    _timed(durations, "neural_gas_fast", fast)
     for grid in seeds:
         _ = grid.points_mm, grid.uv  # cached: taking the seeds is a stage of its own
         _timed(durations, "neural_gas_live", [partial(live.update, grid.points_mm, grid.uv)])

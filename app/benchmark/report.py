@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from selective_depth.app.benchmark.bench import BenchReport, bench, ratios
+from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.output import check_output, write_output
 from selective_depth.app.pipeline import say
 
@@ -66,40 +66,37 @@ def run_bench(source: str, frames: int | None, *, json: Path | None, page: Path 
 
 def print_bench(report: BenchReport) -> None:
     """Print stages, peers and ratios as tables."""
-    console = Console(highlight=False)
-    console.print(
+    Console(highlight=False).print(
         f"\n{report.source}: {report.frames} frames in real time at {report.fps:.1f} frames/s,"
         f" {report.dropped} dropped, {report.threads} threads",
         soft_wrap=True,
     )
-    stages = Table(box=None, pad_edge=False)
-    for heading in ("milliseconds", "p50", "p99", "max", "runs"):
-        stages.add_column(heading, justify="left" if heading == "milliseconds" else "right")
-    for name, each in report.stages.items():
-        figures = (each.p50_ms, each.p99_ms, each.max_ms)
-        stages.add_row(name, *(f"{figure:,.2f}" for figure in figures), f"{each.count:,}")
-    console.print(stages)
+    print_table(_stage_rows(report), ("milliseconds", "p50", "p99", "max", "runs"))
     if report.peers:
-        others = Table(box=None, pad_edge=False)
-        others.add_column("\nthe same work elsewhere")
-        others.add_column("seconds", justify="right", vertical="bottom")
-        others.add_column("", justify="right")
-        for pair, ratio in ratios(report).items():
-            peer = pair.partition(" / ")[0]
-            others.add_row(pair, f"{report.peers[peer]:,.2f}", f"{ratio:,.0f} times")
-        console.print(others)
+        others = [(f"{peer} / {stage}", took, f"{more} times") for peer, took, stage, more in _peer_rows(report)]
+        print_table(others, ("the same work elsewhere", "seconds", ""))
+
+
+def _stage_rows(report: BenchReport) -> list[tuple[str, ...]]:
+    """A stage's name, its milliseconds (median, 99th percentile, maximum) and runs, as text."""
+    return [
+        (name, *(f"{ms:,.2f}" for ms in (each.p50_ms, each.p99_ms, each.max_ms)), f"{each.count:,}")
+        for name, each in report.stages.items()
+    ]
+
+
+def _peer_rows(report: BenchReport) -> list[tuple[str, str, str, str]]:
+    """A peer's name, its seconds, our stage and how many times longer it takes, as text."""
+    rows = []
+    for pair, ratio in ratios(report).items():
+        peer, _, stage = pair.partition(" / ")
+        rows.append((peer, f"{report.peers[peer]:,.2f}", stage, f"{ratio:,.0f}"))
+    return rows
 
 
 def to_page(report: BenchReport) -> str:
     """The benchmark page of the documentation, in Markdown."""
-    stages = "\n".join(
-        f"| `{name}` | {each.p50_ms:,.2f} | {each.p99_ms:,.2f} | {each.max_ms:,.2f} | {each.count:,} |"
-        for name, each in report.stages.items()
-    )
-    peers = "\n".join(
-        f"| `{pair.partition(' / ')[0]}` | {report.peers[pair.partition(' / ')[0]]:,.2f} s |"
-        f" `{pair.partition(' / ')[2]}` | {ratio:,.0f} |"
-        for pair, ratio in ratios(report).items()
-    )
+    stages = "\n".join(f"| `{name}` | {' | '.join(figures)} |" for name, *figures in _stage_rows(report))
+    peers = "\n".join(f"| `{peer}` | {took} s | `{stage}` | {more} |" for peer, took, stage, more in _peer_rows(report))
     host = ", ".join(f"{name} {value}" for name, value in report.machine.items())
     return PAGE.format(report=report, stages=stages, peers=peers, host=host)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -92,15 +91,12 @@ def epoch_selections(
         yield length, by_metric(NeuralGasSelector(nodes, length, "exact", seed).select(seeds))
 
 
-def by_metric(selection: RegionSelection) -> dict[EdgeMetric, RegionSelection]:
+def by_metric(chosen: RegionSelection) -> dict[EdgeMetric, RegionSelection]:
     """Regions of one set of nodes by both edge metrics."""
+    error_mm = chosen.quantisation_error_mm
     return {
         metric: delaunay_regions(
-            selection.nodes_mm,
-            selection.nodes_uv,
-            selection.mask.shape,
-            edge_metric=metric,
-            quantisation_error_mm=selection.quantisation_error_mm,
+            chosen.nodes_mm, chosen.nodes_uv, chosen.mask.shape, edge_metric=metric, quantisation_error_mm=error_mm
         )
         for metric in METRICS
     }
@@ -182,8 +178,7 @@ def _figure(
     return sheet(rows, width_in, legend=False)
 
 
-@dataclass(frozen=True)
-class TableRow:
+class TableRow(NamedTuple):
     """One training of the table; shares are of the frame's pixels and squared error, 0..1.
 
     Time is that of the processor, all threads together: it does not depend on what else runs.
@@ -236,15 +231,11 @@ def node_table(
                 start = time.process_time()
                 chosen = selector.select(grid)
                 seconds = time.process_time() - start
-                shares = [
-                    share
-                    for region in (chosen.mask, chosen.complement)
-                    for share in (
-                        float(region[known].mean()) if known.any() else 0.0,
-                        float(square[region].sum() / max(square.sum(), 1e-12)),
-                    )
-                ]
-                rows.append((seconds, chosen.quantisation_error_mm, *shares))
+                row = [seconds, chosen.quantisation_error_mm]
+                for region in (chosen.mask, chosen.complement):
+                    row.append(float(region[known].mean()) if known.any() else 0.0)
+                    row.append(float(square[region].sum() / max(square.sum(), 1e-12)))
+                rows.append(row)
             means = (float(value) for value in np.mean(rows, axis=0))
             yield TableRow(count, f"{length} epochs" if length else "fast", *means)
 
@@ -263,14 +254,9 @@ def table_markdown(rows: Sequence[TableRow]) -> str:
         " complement: pixels | complement: error |",
         "|" + "---:|" * 8,
     ]
-    for row in rows:
-        shares = " | ".join(
-            f"{share:.1%}"
-            for share in (row.mask_share, row.mask_error_share, row.complement_share, row.complement_error_share)
-        )
-        lines.append(
-            f"| {row.nodes:,} | {row.training} | {row.seconds:.3g} | {row.quantisation_error_mm:.2f} | {shares} |"
-        )
+    for nodes, training, seconds, error_mm, *shares in rows:
+        told = " | ".join(f"{share:.1%}" for share in shares)
+        lines.append(f"| {nodes:,} | {training} | {seconds:.3g} | {error_mm:.2f} | {told} |")
     return "\n".join(lines) + "\n"
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
+from rich.markup import escape
 
 from selective_depth.app.archive.batch import recordings
 from selective_depth.app.archive.unit import Recording
+from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, OK
 from selective_depth.app.console.output import make_folder
@@ -59,9 +59,7 @@ def check(sources: Sequence[str], *, repair: Path | None, timeout_s: float) -> i
 
 def _several(doing: str, found: Sequence[Recording], do: Callable[[Recording], tuple[int, str]]) -> int:
     """Do something with each of several recordings and print what came of it; returns the exit code."""
-    table = Table(box=None, pad_edge=False)
-    for name, side in (("recording", "left"), ("frames", "right"), ("", "left")):
-        table.add_column(name, justify=side, overflow="fold")  # type: ignore[arg-type]
+    rows: list[tuple[str, str, str]] = []
     wrong = 0
     with FrameProgress(doing, None) as progress:
         for at, each in enumerate(found, start=1):
@@ -70,9 +68,9 @@ def _several(doing: str, found: Sequence[Recording], do: Callable[[Recording], t
             except SourceError as error:
                 frames, trouble = 0, str(error)
             wrong += bool(trouble)
-            table.add_row(each.name, f"{frames:,}", Text(trouble or "whole"))
+            rows.append((escape(each.name), f"{frames:,}", escape(trouble or "whole")))
             progress.update(at, f"of the recording{'s' * (len(found) > 1)}")
-    Console(highlight=False).print(table)
+    print_table(rows, ("recording", "frames", ""), justify="lrl")
     say(f"{len(found):,} recordings, {wrong:,} not whole")
     return FAILED if wrong else OK
 
@@ -213,25 +211,22 @@ def _save(source: DepthSource, out: Path, frames: int | None, progress: FramePro
 def _print_check(report: OniReport) -> None:
     console = Console(highlight=False)
     console.print(str(report.path), soft_wrap=True)
-    table = Table(box=None, pad_edge=False, show_header=False)
-    for justify in ("left", "right", "left"):
-        table.add_column("", justify=justify)
-    table.add_row("size", f"{report.size_bytes:,}", "bytes")
+    rows = [("size", f"{report.size_bytes:,}", "bytes")]
     if report.tail_bytes:
-        table.add_row("of it unused, at the end", f"{report.tail_bytes:,}", "bytes")
+        rows.append(("of it unused, at the end", f"{report.tail_bytes:,}", "bytes"))
     if report.version:
-        table.add_row("version of the format", report.version, "")
+        rows.append(("version of the format", report.version, ""))
     for node in report.nodes:
         if node.is_stream:
             codec = node.codec.decode("ascii", "replace")
-            table.add_row(f"{node.name} ({codec})", f"{len(node.frames):,}", "frames")
+            rows.append((f"{node.name} ({codec})", f"{len(node.frames):,}", "frames"))
     if report.camera is not None:
-        table.add_row("frame size", f"{report.camera.width}x{report.camera.height}", "pixels")
-        table.add_row("focal length", f"{report.camera.fx:.1f}", "pixels")
-        table.add_row("frame rate", f"{report.fps:g}", "frames/s")
-        table.add_row("duration", f"{report.duration_s:.2f}", "s")
-    table.add_row("readable depth frames", f"{report.readable_frames:,}", "frames")
-    console.print(table)
+        rows.append(("frame size", f"{report.camera.width}x{report.camera.height}", "pixels"))
+        rows.append(("focal length", f"{report.camera.fx:.1f}", "pixels"))
+        rows.append(("frame rate", f"{report.fps:g}", "frames/s"))
+        rows.append(("duration", f"{report.duration_s:.2f}", "s"))
+    rows.append(("readable depth frames", f"{report.readable_frames:,}", "frames"))
+    print_table(rows, justify="lrl")
     for problem in report.problems[:MOST_PROBLEMS]:
         console.print(str(problem), soft_wrap=True, markup=False)
     if len(report.problems) > MOST_PROBLEMS:

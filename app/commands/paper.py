@@ -6,12 +6,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
 from selective_depth.app.commands.figures import draw_densities, draw_epochs
 from selective_depth.app.commands.snapshot import nth_frame, short_name, snapshot
-from selective_depth.app.console.command import colours
+from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import check_picture
 from selective_depth.app.console.progress import waiting
@@ -68,9 +65,7 @@ def draw_figure(
 
 def print_times(sources: Sequence[str], frame: int) -> int:
     """Print what both methods take on each source, the paper's times beside them."""
-    console = Console(highlight=False, no_color=not colours())
-    heads = ("", "NG exact", "NG fast", "ImpMap", "paper: NG", "ImpMap")
-    shown = Table(*heads, title="Table 1: seconds per frame", title_justify="left", box=None)
+    rows = []
     improvement = ImprovementSelector(exponent=1.9999, by_sums=True)
     methods = (NeuralGasSelector(algorithm="exact"), NeuralGasSelector(), improvement)
     warm = SeedGrid.from_frame(nth_frame(sources[0], frame))
@@ -84,6 +79,7 @@ def print_times(sources: Sequence[str], frame: int) -> int:
             method.select(seeds)
             seconds.append(time.perf_counter() - start)
         papers = PAPERS_SECONDS.get(short_name(uri), ())
-        shown.add_row(short_name(uri), *(f"{s:.3g}" for s in (*seconds, *papers)))
-    console.print(shown)
+        rows.append((short_name(uri), *(f"{s:.3g}" for s in (*seconds, *papers))))
+    heads = ("", "NG exact", "NG fast", "ImpMap", "paper: NG", "ImpMap")
+    print_table(rows, heads, title="Table 1: seconds per frame")
     return OK

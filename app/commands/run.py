@@ -11,14 +11,13 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 
-import numpy as np
-
 from selective_depth.app.commands.model import save_result
+from selective_depth.app.commands.snapshot import row_of
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
-from selective_depth.app.pictures import StillRow, contact_sheet, write_picture
+from selective_depth.app.pictures import contact_sheet, write_picture
 from selective_depth.app.pictures.palette import FIGURES
 from selective_depth.app.pipeline import (
     Feed,
@@ -175,19 +174,20 @@ class Session:
                 report.dropped = source.dropped - report.dropped_starting
                 report.stages = pipeline.times.summary()
             if seen.save is not None and self.last is not None:
-                self._write_beside(seen.save)
+                self._write_beside(seen.save, self.last)
             if seen.save_model is not None and self.last is not None:
                 report.written += save_result(seen.save_model, self.last)
         return self._code
 
     def _open_viewer(self, pipeline: Pipeline, frames: int | None) -> Viewer:
         """Open every place where the run is to be seen, and tell what came of it."""
+        spend = self.settings.acquire
         viewer = Viewer(
             self.settings.viewer,
             live=self.report.live,
             times=pipeline.times,
             frames=frames,
-            title=f"{Path(self._uri).name} {self._driven_by()}",
+            title=f"{Path(self._uri).name} {f'by {spend.by}' if spend.budget else ''}",
             fallback=Path("out", "live.rrd" if self._uri.startswith("openni") else "replay.rrd"),
         )
         self.settings = dataclasses.replace(self.settings, viewer=viewer.options)
@@ -196,11 +196,6 @@ class Session:
         if viewer.served_url:
             say(f"Serving; join with '{join_command(viewer.served_url)}'.")
         return viewer
-
-    def _driven_by(self) -> str:
-        """What drives the shots; empty without a budget."""
-        spend = self.settings.acquire
-        return f"by {spend.by}" if spend.budget else ""
 
     def _flow(self, source: DepthSource, pipeline: Pipeline, viewer: Viewer, progress: FrameProgress) -> None:
         """Source to pipeline to result to sinks, one frame after the other."""
@@ -254,48 +249,26 @@ class Session:
             dropped_viewer=sum(viewer.dropped.values()),
             **{name: value for name, value in figures_of(result).items() if name in FIGURES},
         )
-        if result.memory is not None:
-            size = result.frame.depth_mm.size
-            result.figures["measured"] = 100 * len(result.memory.uv) / size
-            result.figures["known"] = 100 * np.count_nonzero(result.memory.known) / size
         result.stages_ms.update(pipeline.times.last_ms() | result.stages_ms)
         self.report.take(result)
         self.report.seconds = now_s - self._ready_s
         self.last = result
         viewer.show(result)
 
-    def _write_beside(self, saved: Path) -> None:
+    def _write_beside(self, saved: Path, last: FrameResult) -> None:
         """Settings and a picture of the last frame."""
         settings_file, picture_file = _beside(saved)
         save_settings(settings_file, self.settings, self._uri)
-        self.report.written += [saved, settings_file]
-        if self.last is not None:
-            last = self.last
-            row = StillRow(
-                f"{self._uri.rstrip('/').rpartition('/')[2]}, frame {last.frame.index}",
-                last.frame,
-                last.regions,
-                last.improvement,
-                last.acquisition,
-            )
-            write_picture(picture_file, contact_sheet([row]))
-            self.report.written.append(picture_file)
+        title = f"{self._uri.rstrip('/').rpartition('/')[2]}, frame {last.frame.index}"
+        write_picture(picture_file, contact_sheet([row_of(last, title)]))
+        self.report.written += [saved, settings_file, picture_file]
 
 
 def _tell(source: DepthSource) -> None:
-    camera, count = source.camera, source.frame_count
+    at, count = source.camera, "endless" if source.frame_count is None else source.frame_count
     log.info(
-        "%s: %s frames, %dx%d, %.4g frames/s, fx %.1f fy %.1f cx %.1f cy %.1f; %d kernel threads",
-        source.uri,
-        "endless" if count is None else count,
-        camera.width,
-        camera.height,
-        source.fps,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-        default_threads(),
+        f"{source.uri}: {count} frames, {at.width}x{at.height}, {source.fps:.4g} frames/s, fx {at.fx:.1f}"
+        f" fy {at.fy:.1f} cx {at.cx:.1f} cy {at.cy:.1f}; {default_threads()} kernel threads"
     )
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
 from selective_depth.app.console import interrupt
+from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
@@ -41,13 +39,11 @@ def print_devices() -> int:
     if not found:
         say(f"no sensor found. {usb_advice(runtime.drivers) or UNKNOWN_ADVICE}")
         return FAILED
-    table = Table(box=None, pad_edge=False)
-    for heading in ("device", "vendor", "name", "USB"):
-        table.add_column(heading, overflow="fold")
+    rows = []
     for each in found:
         usb = f"{each.usb_vendor_id:04x}:{each.usb_product_id:04x}" if each.usb_vendor_id else ""
-        table.add_row(each.uri, each.vendor, each.name, usb)
-    Console(highlight=False).print(table)
+        rows.append((each.uri, each.vendor, each.name, usb))
+    print_table(rows, ("device", "vendor", "name", "USB"), "l")
     return OK
 
 

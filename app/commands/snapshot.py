@@ -11,7 +11,7 @@ from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import IMAGES, check_picture, is_picture, make_folder, write_image
 from selective_depth.app.console.progress import waiting
 from selective_depth.app.pictures import StillRow, alone, contact_sheet, panels_of, write_picture
-from selective_depth.app.pipeline import Pipeline, open_and_tell, say
+from selective_depth.app.pipeline import FrameResult, Pipeline, open_and_tell, say
 from selective_depth.app.settings import PictureOptions, Settings
 from selective_depth.drivers.errors import SourceEndedError
 from selective_depth.drivers.frame import DepthFrame
@@ -47,8 +47,12 @@ def still_row(frame: DepthFrame, title: str, settings: Settings) -> StillRow:
     # One frame has no frame before it to go on from.
     cold = replace(settings, gas=replace(settings.gas, training="cold"))
     with Pipeline(cold) as pipeline:
-        result = pipeline.make(frame)
-    return StillRow(title, frame, result.regions, result.improvement, result.acquisition)
+        return row_of(pipeline.make(frame), title)
+
+
+def row_of(result: FrameResult, title: str) -> StillRow:
+    """A frame's result as a row of a contact sheet."""
+    return StillRow(title, result.frame, result.regions, result.improvement, result.acquisition)
 
 
 def snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings, page: PictureOptions) -> list[Path]:

@@ -25,7 +25,6 @@ import functools
 import inspect
 import io
 import re
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -274,8 +273,3 @@ def completion(shell: str) -> str:
             config=(tyro.conf.FlagCreatePairsOff,),
         )
     return script.getvalue()
-
-
-def colours() -> bool:
-    """Whether standard output is a terminal that takes colours."""
-    return sys.stdout.isatty()

@@ -156,6 +156,14 @@ def frames_of(sources: Sequence[str], every: int, frames: int | None) -> Iterato
                     break
 
 
+def check_named(sources: Sequence[str], budgets: Sequence[float]) -> None:
+    """Refuse a comparison on no source, or of no budget."""
+    if not sources:
+        raise UsageError("no source was named; give recordings, folders or scenes.")
+    if not budgets:
+        raise UsageError("--budget names no share; give one or more, such as 5% 10%.")
+
+
 def outcomes(
     sources: Sequence[str],
     *,
@@ -202,10 +210,7 @@ def outcomes(
     SourceNotFoundError
         If the sources hold no frame with depth.
     """
-    if not sources:
-        raise UsageError("no source was named; give recordings, folders or scenes.")
-    if not budgets:
-        raise UsageError("--budget names no share; give one or more, such as 5% 10%.")
+    check_named(sources, budgets)
     wanted = {*strategies_of(strategies), "uniform", "oracle"}
     names = [n for n in STRATEGIES if n in wanted] + sorted(wanted.difference(STRATEGIES))
     jobs = jobs or default_threads()
@@ -326,8 +331,3 @@ def summarise(found: Sequence[Outcome]) -> Results:
             }
         results[f"{budget:.2f}" if round(budget, 2) == budget else f"{budget:g}"] = table
     return results
-
-
-def evaluate(sources: Sequence[str], **options: object) -> Results:
-    """Run the strategies on frames of some sources and sum up (see `outcomes`)."""
-    return summarise(outcomes(sources, **options))  # type: ignore[arg-type]

@@ -12,14 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
-from rich.table import Table
 
-from selective_depth.app.console.command import colours
-from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.output import check_output, check_picture, write_output
+from selective_depth.app.console.columns import print_table
+from selective_depth.app.console.output import write_output
 from selective_depth.app.console.progress import FrameProgress
-from selective_depth.app.evaluation.evaluate import ENDLESS_FRAMES
+from selective_depth.app.evaluation.evaluate import ENDLESS_FRAMES, check_named
 from selective_depth.app.pictures import sheet, write_picture
 from selective_depth.app.pictures.panels import depth_panel, error_panel
 from selective_depth.app.pipeline import say
@@ -169,14 +166,9 @@ def run_over_time(
     UsageError
         If there is no source or no budget.
     OutputError
-        If the file cannot be written.
+        If a file cannot be written.
     """
-    if not sources:
-        raise UsageError("no source was named; give recordings, folders or scenes.")
-    if not options.budget:
-        raise UsageError("--budget names no share; give one, such as 2%.")
-    check_picture(files.picture)
-    check_output(files.json)
+    check_named(sources, options.budget)
     found: dict[str, dict[str, Course]] = {}
     last: list[tuple[DepthFrame, TemporalStep]] = []
     for uri in sources:
@@ -219,15 +211,13 @@ def _picture(frame: DepthFrame, step: TemporalStep) -> Figure:
 
 
 def _print(uri: str, ways: dict[str, Course], budget: float) -> None:
-    console = Console(highlight=False, no_color=not colours())
     count = len(ways["memory"].rmse_mm)
-    title = f"{uri}: {count} frames, {100 * budget:g} % of the pixels a frame with memory"
-    shown = Table(title=title, title_justify="left", box=None, padding=(0, 0, 0, 2))
     at = sorted({0, count // 2, count - 1})
-    for head in ("RMSE / MAE, mm", *(f"frame {index}" for index in at), "mean"):
-        shown.add_column(head, no_wrap=True)
+    rows = []
     for way, course in ways.items():
-        cells = [f"{course.rmse_mm[i]:.1f} / {course.mae_mm[i]:.1f}" for i in at]
-        mean = f"{np.nanmean(course.rmse_mm):.1f} / {np.nanmean(course.mae_mm):.1f}"
-        shown.add_row(way.replace("_", " "), *cells, mean, style="bold" if way == "memory" else "")
-    console.print(shown)
+        figures = [(course.rmse_mm[i], course.mae_mm[i]) for i in at]
+        figures.append((float(np.nanmean(course.rmse_mm)), float(np.nanmean(course.mae_mm))))
+        rows.append((way.replace("_", " "), *(f"{rmse:.1f} / {mae:.1f}" for rmse, mae in figures)))
+    heads = ("RMSE / MAE, mm", *(f"frame {index}" for index in at), "mean")
+    title = f"{uri}: {count} frames, {100 * budget:g} % of the pixels a frame with memory"
+    print_table(rows, heads, bold="memory", title=title)

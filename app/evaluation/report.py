@@ -7,10 +7,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
-from selective_depth.app.console.command import colours
+from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.output import check_output, check_picture, write_output
 from selective_depth.app.console.progress import FrameProgress
 from selective_depth.app.evaluation.evaluate import Outcome, Results, frames_of, outcomes, summarise
@@ -38,6 +36,17 @@ TITLES = {
     "loop": "Surface score, closed loop",
     "oracle": "Oracle",
 }
+COLUMNS = {
+    "ratio": ("geo", "{:.3f}"),
+    "worst": ("worst", "{:.3f}"),
+    "share": ("share", "{:.1%}"),
+    "least": ("share_min", "{:.1%}"),
+    "RMSE": ("rmse_mm", "{:.1f}"),
+    "MAE": ("mae_mm", "{:.2f}"),
+    "wrong": ("wrong", "{:.2%}"),
+    "missed": ("missed", "{:.0%}"),
+}
+"""Columns of the table: which figure, and how it is written."""
 
 
 def run_evaluation(
@@ -62,24 +71,21 @@ def run_evaluation(
     check_table(files.table)
     if options.over_time:
         return run_over_time(sources, options, settings, files)
-    budgets, rounds = options.budget, options.rounds
     seeds_shape = settings.seeds.rows, settings.seeds.columns
     with FrameProgress("Evaluating", None) as bar:
         found = outcomes(
             sources,
             every=options.every,
             frames=options.frames,
-            budgets=budgets,
-            rounds=rounds,
+            budgets=options.budget,
+            rounds=options.rounds,
             random_seeds=options.random_seeds,
             strategies=options.strategies,
             jobs=options.scheduler or options.jobs,
             settings=settings,
             progress=lambda done, total: bar.update(done, f"of {total}"),
         )
-    results = summarise(found)
-    count = len({outcome.frame for outcome in found})
-    print_results(results, count, rounds)
+    print_results(summarise(found), len({outcome.frame for outcome in found}), options.rounds)
     if files.json is not None:
         made_with = {
             "comparison": asdict(options),
@@ -92,7 +98,8 @@ def run_evaluation(
         write_output(files.page, to_markdown(found))
     if files.picture is not None:
         frame = next(frames_of(sources, options.every, 1))
-        shown = comparison(frame, budgets[0], rounds=rounds, seeds_shape=seeds_shape, width_in=page.width)
+        budget, rounds = options.budget[0], options.rounds
+        shown = comparison(frame, budget, rounds=rounds, seeds_shape=seeds_shape, width_in=page.width)
         write_picture(files.picture, shown, page.dpi)
     if files.curves is not None:
         write_picture(files.curves, curves(found, page.width), page.dpi)
@@ -108,49 +115,29 @@ def _percent(budget: str) -> str:
 
 def print_results(results: Results, frames: int, rounds: int) -> None:
     """Show the figures as one table per budget."""
-    console = Console(highlight=False, no_color=not colours())
     for budget, table in results.items():
-        shown = Table(
+        print_table(
+            [(name, *_cells(figures)) for name, figures in table.items()],
+            ("", *COLUMNS),
+            bold="loop",
             title=f"+{_percent(budget)} of the pixels · {frames} frames · closed loops of {rounds} rounds",
-            title_justify="left",
             caption="ratio of the RMSE (mm) to uniform's, geometric mean and worst; share of the"
             " way from uniform to the oracle, mean and least; wrong: off by > 20 mm and > 2 %",
-            caption_justify="left",
-            padding=(0, 0, 0, 1),
-            box=None,
         )
-        shown.add_column("", no_wrap=True)
-        for head in ("ratio", "worst", "share", "least", "RMSE", "MAE", "wrong", "missed"):
-            shown.add_column(head, justify="right")
-        for name, row in table.items():
-            shown.add_row(
-                name,
-                f"{row['geo']:.3f}",
-                f"{row['worst']:.3f}",
-                f"{row['share']:.1%}",
-                f"{row['share_min']:.1%}",
-                f"{row['rmse_mm']:.1f}",
-                f"{row['mae_mm']:.2f}",
-                f"{row['wrong']:.2%}",
-                f"{row['missed']:.0%}",
-                style="bold" if name == "loop" else "",
-            )
-        console.print(shown)
+
+
+def _cells(figures: dict[str, float]) -> list[str]:
+    return [form.format(figures[name]) for name, form in COLUMNS.values()]
 
 
 def to_markdown(found: Sequence[Outcome]) -> str:
     """The figures as a Markdown table, for the documentation."""
     lines = []
     for budget, table in summarise(found).items():
-        lines += [
-            f"| +{_percent(budget)} | geo | worst | oracle share | least | RMSE mm | MAE mm |",
-            "|---|---|---|---|---|---|---|",
-        ]
-        for name, row in table.items():
-            lines.append(
-                f"| {strategy_of(name).about} (`{name}`) | {row['geo']:.3f} | {row['worst']:.3f} | {row['share']:.1%} |"
-                f" {row['share_min']:.1%} | {row['rmse_mm']:.1f} | {row['mae_mm']:.2f} |"
-            )
+        lines.append(f"| +{_percent(budget)} | geo | worst | oracle share | least | RMSE mm | MAE mm |")
+        lines.append("|---" * 7 + "|")
+        for name, figures in table.items():
+            lines.append(f"| {strategy_of(name).about} (`{name}`) | {' | '.join(_cells(figures)[:6])} |")
         lines.append("")
     return "\n".join(lines)
 

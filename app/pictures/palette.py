@@ -98,8 +98,8 @@ FIGURES = {
     "truth_rmse_mm": ("model to the truth", 0x56B4E9FF),
     "sensor_rmse_mm": ("frame to the truth", 0xCC79A7FF),
     "even_rmse_mm": ("even lattice", 0x999999FF),
-    "measured": ("measured in this frame", 0x56B4E9FF),
-    "known": ("known in all", 0x26A69AFF),
+    "measured_percent": ("measured in this frame", 0x56B4E9FF),
+    "known_percent": ("known in all", 0x26A69AFF),
 }
 """Running figures of a frame: how a plot calls and colours them."""
 

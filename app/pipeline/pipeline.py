@@ -99,8 +99,6 @@ class Pipeline:
         # longest of them.
         self._beside: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(2, thread_name_prefix="beside")
         self._modelling = ThreadPoolExecutor(1, thread_name_prefix="model")
-        # One thread: frames enter the memory in their order.
-        self._remembering = ThreadPoolExecutor(1, thread_name_prefix="memory")
         self._under_way: deque[Callable[[], FrameResult]] = deque()
         self._pending: Future[Model] | None = None
         self._since_model = MODEL_EVERY
@@ -145,7 +143,7 @@ class Pipeline:
         step: TemporalStep | None = None
         modelling: Future[tuple[Acquisition | None, Model | None]]
         if self._remembers:
-            step = self._remembering.submit(self._remember, frame, stages_ms).result()
+            step = self._remember(frame, stages_ms)
             seeds = step.seeds
             modelling = self._beside.submit(self._told_by, step, frame, stages_ms)
         else:
@@ -273,4 +271,3 @@ class Pipeline:
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         self._beside.shutdown(cancel_futures=True)
         self._modelling.shutdown(cancel_futures=True)
-        self._remembering.shutdown(cancel_futures=True)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from selective_depth.app import __version__
+from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.output import write_output
 from selective_depth.app.console.settings_file import to_toml
 from selective_depth.app.pipeline.figures import figures_of
@@ -58,6 +59,8 @@ class RunReport:
         The sensor's at the end.
     by : str
         What drove the shots; empty without a budget.
+    means : dict of str to Mean
+        Of the results' figures, by name, and of "spent", the share of the pixels measured.
     """
 
     source: str
@@ -70,14 +73,7 @@ class RunReport:
     stages: dict[str, StageSummary] = field(default_factory=dict)
     state: str = ""
     by: str = ""
-    samples: Mean = field(default_factory=Mean)
-    quantisation_error_mm: Mean = field(default_factory=Mean)
-    rmse_mm: Mean = field(default_factory=Mean)
-    truth_rmse_mm: Mean = field(default_factory=Mean)
-    sensor_rmse_mm: Mean = field(default_factory=Mean)
-    known_percent: Mean = field(default_factory=Mean)
-    measured_percent: Mean = field(default_factory=Mean)
-    even_rmse_mm: Mean = field(default_factory=Mean)
+    means: dict[str, Mean] = field(default_factory=lambda: defaultdict(Mean))
     troubles: list[str] = field(default_factory=list)
     written: list[Path] = field(default_factory=list)
 
@@ -89,22 +85,21 @@ class RunReport:
     @property
     def gain(self) -> str:
         """What selecting was worth, in a line; empty where nothing was held against an even lattice."""
-        if not self.even_rmse_mm.count:
+        means = self.means
+        if not means["even_rmse_mm"].count:
             return ""
-        remembered = self.known_percent.count and self.truth_rmse_mm.count
-        rmse_mm, even_mm = (self.truth_rmse_mm if remembered else self.rmse_mm).value, self.even_rmse_mm.value
-        times = f"{even_mm / max(rmse_mm, 1e-9):.1f} times as good"
-        measured = f"{self.measured_percent.value:.1f}% of the pixels"
-        return f"{measured} · {rmse_mm:.1f} mm · even lattice {even_mm:.1f} mm · {times}"
+        remembered = means["known_percent"].count and means["truth_rmse_mm"].count
+        rmse_mm, even_mm = means["truth_rmse_mm" if remembered else "rmse_mm"].value, means["even_rmse_mm"].value
+        spent = f"{means['measured_percent'].value:.1f}% of the pixels · {rmse_mm:.1f} mm"
+        return f"{spent} · even lattice {even_mm:.1f} mm · {even_mm / max(rmse_mm, 1e-9):.1f} times as good"
 
     def take(self, result: FrameResult) -> None:
         """Add a frame's result."""
         self.frames += 1
+        for name, value in figures_of(result).items():
+            self.means[name].add(value)
         if result.acquisition is not None:
             self.by = result.acquisition.by
-        for name, value in figures_of(result).items():
-            if isinstance(mean := getattr(self, name, None), Mean):
-                mean.add(value)
 
 
 def say(sentence: str) -> None:
@@ -114,43 +109,33 @@ def say(sentence: str) -> None:
 
 def print_report(report: RunReport) -> None:
     """Print the table of a run on standard output; without colours if that is no terminal."""
-    console = Console(highlight=False)
+    console, means = Console(highlight=False), report.means
     console.print(report.source, soft_wrap=True)  # a table would break a long path
-    table = Table(box=None, pad_edge=False, show_header=False)
-    for side in ("left", "right", "left"):
-        table.add_column(justify=side)
-    table.add_row("frames", f"{report.frames:,}", "")
-    table.add_row("whole loop", f"{report.fps:.1f}", "frames/s")
+    rows = [("frames", f"{report.frames:,}", ""), ("whole loop", f"{report.fps:.1f}", "frames/s")]
     if report.live:
-        table.add_row("skipped while starting", f"{report.dropped_starting:,}", "frames")
-        table.add_row("skipped to keep up", f"{report.dropped:,}", "frames")
-        table.add_row("sensor at the end", report.state, "")
-    for name, missed in report.missed.items():
-        table.add_row(f"not shown in {name}", f"{missed:,}", "frames")
-    table.add_row("samples with depth", f"{report.samples.value:,.0f}", "per frame")
-    if report.quantisation_error_mm.count:
-        table.add_row("quantisation error", f"{report.quantisation_error_mm.value:.1f}", "mm")
+        rows.append(("skipped while starting", f"{report.dropped_starting:,}", "frames"))
+        rows.append(("skipped to keep up", f"{report.dropped:,}", "frames"))
+        rows.append(("sensor at the end", report.state, ""))
+    rows += [(f"not shown in {name}", f"{missed:,}", "frames") for name, missed in report.missed.items()]
+    rows.append(("samples with depth", f"{means['samples'].value:,.0f}", "per frame"))
     if report.by:
-        table.add_row("shots chosen by", report.by, "")
-    if report.rmse_mm.count:
-        table.add_row("model RMSE", f"{report.rmse_mm.value:.1f}", "mm to the frame")
-    if report.truth_rmse_mm.count:
-        table.add_row("", f"{report.truth_rmse_mm.value:.1f}", "mm to the truth")
-        table.add_row("whole frame", f"{report.sensor_rmse_mm.value:.1f}", "mm to the truth")
-    if report.known_percent.count:
-        table.add_row("pixels known", f"{report.known_percent.value:.1f}%", "on average")
-    console.print(table)
+        rows.append(("shots chosen by", report.by, ""))
+    for title, name, unit in (
+        ("quantisation error", "quantisation_error_mm", "mm"),
+        ("model RMSE", "rmse_mm", "mm to the frame"),
+        ("", "truth_rmse_mm", "mm to the truth"),
+        ("whole frame", "sensor_rmse_mm", "mm to the truth"),
+    ):
+        if means[name].count:
+            rows.append((title, f"{means[name].value:.1f}", unit))
+    if means["known_percent"].count:
+        rows.append(("pixels known", f"{means['known_percent'].value:.1f}%", "on average"))
+    print_table(rows, justify="lrl")
     if report.gain:
         console.print(f"\n{report.gain}", style="bold")
-    stages = Table(box=None, pad_edge=False)
-    stages.add_column("milliseconds")
-    for heading in ("p50", "p99", "max"):
-        stages.add_column(heading, justify="right")
-    for name, times in report.stages.items():
-        figures = (times.p50_ms, times.p99_ms, times.max_ms)
-        stages.add_row(name, *(f"{figure:.1f}" for figure in figures))
     console.print()
-    console.print(stages)
+    stages = [(name, *(f"{ms:.1f}" for ms in (t.p50_ms, t.p99_ms, t.max_ms))) for name, t in report.stages.items()]
+    print_table(stages, ("milliseconds", "p50", "p99", "max"))
     if report.written:
         console.print()
     for path in report.written:

@@ -119,7 +119,7 @@ def _figures(memory: bool) -> rrb.Horizontal:
             row_shares=[2, 1],
         ),
         plot("Errors in mm", "quantisation_error_mm", *errors),
-        *([plot("Pixels, %", "measured", "known")] if memory else []),
+        *([plot("Pixels, %", "measured_percent", "known_percent")] if memory else []),
         column_shares=[1.15, 1.15, 1, 0.9, 0.9, *([0.9] if memory else [])],
     )
 

@@ -65,7 +65,7 @@ class ImprovementSelection(Selection):
         return self.raw
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class ImprovementSelector:
     """Selects where a measurement would most improve the model of the scene.
 

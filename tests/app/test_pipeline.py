@@ -89,7 +89,7 @@ def test_replay_takes_every_frame_once(monkeypatch: pytest.MonkeyPatch, budget: 
     expected = {"read", "seeds", "neural_gas", "improvement", "loop"}
     assert set(report.stages) == expected | ({"acquire", "model"} if budget else set())
     assert all(times.count == 7 for name, times in report.stages.items() if name != "read")
-    assert report.rmse_mm.count == (7 if budget else 0)
+    assert report.means["rmse_mm"].count == (7 if budget else 0)
     assert session.last is not None
     assert session.last.frame.index == 6
 
