@@ -25,6 +25,8 @@ from selective_depth.app.settings import (
     Positive,
     SeedOptions,
     Settings,
+    Source,
+    SourceOrSample,
     TimeLimit,
     optional,
     whole,
@@ -38,8 +40,6 @@ EXAMPLES = (
     (f"{PROGRAM} devices", "what is plugged in, or what is missing"),
 )
 
-Source = Annotated[str, arg(metavar="SOURCE")]
-SourceOrSample = Annotated[str | None, optional("SOURCE")]
 Options = Annotated[Settings, arg(name="")]
 Acquiring = Annotated[AcquireOptions, arg(name="")]
 Page = Annotated[PictureOptions, arg(name="")]

@@ -18,11 +18,11 @@ from selective_depth.app.settings import (
     PictureOptions,
     SeedOptions,
     Settings,
+    Source,
+    SourceOrSample,
     optional,
 )
 
-Source = Annotated[str, arg(metavar="SOURCE")]
-SourceOrSample = Annotated[str | None, optional("SOURCE")]
 Page = Annotated[PictureOptions, arg(name="")]
 Files = Annotated[EvaluationFiles, arg(name="")]
 Compared = Annotated[ComparisonOptions, arg(name="")]

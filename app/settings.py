@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 from tyro.constructors import PrimitiveConstructorSpec
 
+Source = Annotated[str, arg(metavar="SOURCE")]
 MOST_ROUNDS = 254
 """Rounds of an acquisition; those of the selectors, which are not imported for the help's sake."""
 
@@ -83,6 +84,9 @@ _SIZE = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%")
 Memory = Annotated[str, must_be("a size, such as 256MiB or 25%", str, _SIZE.fullmatch), arg(metavar="SIZE")]
 Scheduler = Annotated[str | None, optional("ADDRESS|FILE")]
 Millimetres = Annotated[int | None, whole(0, 65535), optional("MM")]
+
+
+SourceOrSample = Annotated[str | None, optional("SOURCE")]
 
 
 @dataclass(frozen=True)

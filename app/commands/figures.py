@@ -12,16 +12,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.app.commands.snapshot import nth_frame
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import OK
-from selective_depth.app.console.output import check_output, check_picture, write_output
-from selective_depth.app.console.progress import waiting
-from selective_depth.app.pictures import Panel, sheet, write_picture
+from selective_depth.app.console.output import check_output, write_output
+from selective_depth.app.pictures import Panel, sheet
 from selective_depth.app.pictures.panels import backdrop, draw_kept_triangles, draw_nodes, shaded_panel, tinted
 from selective_depth.app.pictures.sheets import WIDTH_IN, Row
 from selective_depth.app.pipeline import open_and_tell, say
-from selective_depth.app.settings import PictureOptions
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.neural_gas import EdgeMetric, NeuralGasSelector, RegionSelection, delaunay_regions
 from selective_depth.selectors.reconstruct import reconstruct
@@ -258,46 +255,6 @@ def table_markdown(rows: Sequence[TableRow]) -> str:
         told = " | ".join(f"{share:.1%}" for share in shares)
         lines.append(f"| {nodes:,} | {training} | {seconds:.3g} | {error_mm:.2f} | {told} |")
     return "\n".join(lines) + "\n"
-
-
-# The commands
-
-
-def draw_epochs(source: str, out: Path, *, save: Path | None, number: int, seed: int, page: PictureOptions) -> int:
-    """Make Fig. 1 of a frame of a source, and a Rerun recording of it; returns the exit code.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    UsageError
-        If the picture is of a format that cannot be made, or there is no such frame.
-    """
-    check_picture(out)
-    check_output(save)
-    frame = nth_frame(source, number)
-    seeds = object_seeds(frame, FIRST_POINTS)
-    with waiting(f"training {len(EPOCHS)} times"):
-        trained = list(epoch_selections(seeds, EPOCHS, FIRST_NODES, seed))
-    write_picture(out, epochs_figure(frame, seeds, trained, page.width), page.dpi)
-    say(f"wrote {out}")
-    if save is not None:
-        from selective_depth.app.viewer import save_trainings
-
-        save_trainings(save, frame, ((length, chosen["3d"]) for length, chosen in trained))
-        say(f"wrote {save}; open it with 'rerun {save}'")
-    return OK
-
-
-def draw_densities(source: str, out: Path, *, number: int, epochs: int, seed: int, page: PictureOptions) -> int:
-    """Make Fig. 2 of a frame of a source; returns the exit code. Raises as `draw_epochs`."""
-    check_picture(out)
-    frame = nth_frame(source, number)
-    with waiting(f"training {len(DENSITIES)} times"):
-        figure = densities_figure(frame, DENSITIES, epochs, seed, page.width)
-    write_picture(out, figure, page.dpi)
-    say(f"wrote {out}")
-    return OK
 
 
 def tabulate_nodes(source: str, *, every: int | None, out: Path | None) -> int:

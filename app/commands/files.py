@@ -157,8 +157,6 @@ def export(source: str, out: Path, frames: int | None) -> int:
     int
         Exit code 0.
     """
-    if frames is not None and frames <= 0:
-        raise UsageError(f"--frames is {frames}; it must be more than 0.")
     ending = out.suffix.lower()
     if ending in OTHER_FILES:
         raise UsageError(

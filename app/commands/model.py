@@ -6,19 +6,19 @@ import io
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from selective_depth.app.commands.snapshot import nth_frame
 from selective_depth.app.console.exit_codes import OK
-from selective_depth.app.console.output import make_folder, write_output
+from selective_depth.app.console.output import make_folder, write_image, write_output
 from selective_depth.app.pictures import palette
 from selective_depth.app.pipeline import FrameResult, say
 from selective_depth.app.pipeline.selecting import selector_of
 from selective_depth.app.settings import Settings
 from selective_depth.drivers.frame import Camera, ColourArray, DepthFrame
 from selective_depth.selectors.acquire import Acquisition, acquire
+from selective_depth.selectors.arrays import pixels_where
 from selective_depth.selectors.seeds import SeedGrid
 
 
@@ -57,18 +57,11 @@ def save_cloud(path: Path, acquisition: Acquisition, camera: Camera, colours: Co
     vertex["round"] = rounds
     last = int(acquisition.round.max(initial=1))
     vertex["rgb"] = palette.channels(palette.round_colours(last))[rounds] if colours is None else colours[kept]
-    header = "\n".join(
-        (
-            "ply",
-            "format binary_little_endian 1.0",
-            "comment selective-depth: millimetres, x right, y down, z forward; round 0 = seed",
-            f"element vertex {len(vertex)}",
-            *(f"property float {axis}" for axis in "xyz"),
-            *(f"property uchar {channel}" for channel in ("red", "green", "blue", "round")),
-            "end_header\n",
-        )
-    )
-    write_output(path, header.encode("ascii") + vertex.tobytes())
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += ["comment selective-depth: millimetres, x right, y down, z forward; round 0 = seed"]
+    header += [f"element vertex {len(vertex)}", *(f"property float {axis}" for axis in "xyz")]
+    header += [f"property uchar {channel}" for channel in ("red", "green", "blue", "round")]
+    write_output(path, "\n".join([*header, "end_header\n"]).encode("ascii") + vertex.tobytes())
     return len(vertex)
 
 
@@ -80,9 +73,7 @@ def save_depth(path: Path, depth_mm: npt.NDArray[np.floating]) -> None:
     OutputError
         If the file cannot be written.
     """
-    whole = np.clip(np.rint(np.nan_to_num(depth_mm)), 0, 65535).astype(np.uint16)
-    _, data = cv2.imencode(".png", whole)
-    write_output(path, data.tobytes())
+    write_image(path, np.clip(np.rint(np.nan_to_num(depth_mm)), 0, 65535).astype(np.uint16))
 
 
 def save_samples(path: Path, acquisition: Acquisition) -> None:
@@ -139,12 +130,10 @@ def save_result(folder: Path, result: FrameResult) -> list[Path]:
     assert acquisition is not None  # there is a budget
     if result.memory is not None:
         known_mm = result.memory.known_mm
-        rows, columns = np.nonzero(known_mm)
-        uv = np.stack((columns, rows), axis=-1).astype(np.int32)
-        rounds = np.zeros(len(uv), np.uint8)
-        acquisition = replace(acquisition, uv=uv, depth_mm=known_mm[rows, columns], round=rounds)
-    depth_mm = acquisition.reconstruct() if result.model is None else result.model.depth_mm
-    return save_model(folder, acquisition, result.frame, depth_mm)
+        uv, depth_mm = pixels_where(known_mm), known_mm[known_mm > 0]
+        acquisition = replace(acquisition, uv=uv, depth_mm=depth_mm, round=np.zeros(len(uv), np.uint8))
+    dense_mm = None if result.model is None else result.model.depth_mm
+    return save_model(folder, acquisition, result.frame, dense_mm)
 
 
 def model_frame(source: str, out: Path, number: int, settings: Settings) -> int:

@@ -6,11 +6,11 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from selective_depth.app.commands.figures import draw_densities, draw_epochs
+from selective_depth.app.commands import figures
 from selective_depth.app.commands.snapshot import nth_frame, short_name, snapshot
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.exit_codes import OK
-from selective_depth.app.console.output import check_picture
+from selective_depth.app.console.output import check_output, check_picture
 from selective_depth.app.console.progress import waiting
 from selective_depth.app.pictures import sheet, write_picture
 from selective_depth.app.pictures.panels import depth_panel, shaded_panel
@@ -38,28 +38,41 @@ def draw_figure(
     Raises
     ------
     OutputError
-        If the picture cannot be written.
+        If a file cannot be written.
     UsageError
         If it is of a format that cannot be made, or a source has no such frame.
     """
     path = out or Path(f"figure-{number}.png")
     check_picture(path)
-    gas = settings.gas
+    check_output(save)
+    if number == 5:
+        with waiting("Running both selectors"):
+            snapshot(sources, frame, path, settings, page)
+        say(f"wrote {path}")
+        return OK
+    gas, trained = settings.gas, []
+    frames = [nth_frame(uri, frame) for uri in (sources if number == 4 else sources[:1])]
     if number == 1:
-        return draw_epochs(sources[0], path, save=save, number=frame, seed=gas.seed, page=page)
-    if number == 2:
-        return draw_densities(sources[0], path, number=frame, epochs=gas.epochs, seed=gas.seed, page=page)
-    if number == 4:
-        frames = [nth_frame(uri, frame) for uri in sources]
+        seeds = figures.object_seeds(frames[0], figures.FIRST_POINTS)
+        with waiting(f"training {len(figures.EPOCHS)} times"):
+            trained = list(figures.epoch_selections(seeds, figures.EPOCHS, figures.FIRST_NODES, gas.seed))
+        made = figures.epochs_figure(frames[0], seeds, trained, page.width)
+    elif number == 2:
+        with waiting(f"training {len(figures.DENSITIES)} times"):
+            made = figures.densities_figure(frames[0], figures.DENSITIES, gas.epochs, gas.seed, page.width)
+    else:
         rows = [
             (short_name(uri), (shaded_panel(shown), depth_panel(shown)))
             for uri, shown in zip(sources, frames, strict=True)
         ]
-        write_picture(path, sheet(rows, page.width, legend=False), page.dpi)
-    else:
-        with waiting("Running both selectors"):
-            snapshot(sources, frame, path, settings, page)
+        made = sheet(rows, page.width, legend=False)
+    write_picture(path, made, page.dpi)
     say(f"wrote {path}")
+    if save is not None and trained:
+        from selective_depth.app.viewer import save_trainings
+
+        save_trainings(save, frames[0], ((length, chosen["3d"]) for length, chosen in trained))
+        say(f"wrote {save}; open it with 'rerun {save}'")
     return OK
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.columns import print_table
-from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pipeline import say
@@ -55,9 +54,6 @@ def record_sensor(out: Path, device: str, *, frames: int | None, seconds: float 
     int
         Exit code: 0, 1 if frames are missing, 130 after Ctrl-C.
     """
-    for option, value in (("--frames", frames), ("--seconds", seconds)):
-        if value is not None and not value > 0:  # NaN is not either
-            raise UsageError(f"{option} is {value}; it must be more than 0.")
     interrupt.check()
     interrupt.allow(interrupt.SAVE_S)
     with FrameProgress(f"Recording {out}", frames) as progress:

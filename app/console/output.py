@@ -48,8 +48,8 @@ def check_output(*paths: Path | None) -> None:
             raise OutputError(f"'{path}' cannot be written: its folder does not exist. Make it.")
 
 
-def check_picture(path: Path | None, endings: Sequence[str] = PICTURES) -> None:
-    """Refuse a picture that cannot be made, before the work is done and not after.
+def check_picture(path: Path | None, endings: Sequence[str] = PICTURES, what: str = "picture") -> None:
+    """Refuse a picture, or the like, that cannot be made, before the work is done and not after.
 
     Parameters
     ----------
@@ -57,6 +57,8 @@ def check_picture(path: Path | None, endings: Sequence[str] = PICTURES) -> None:
         The picture, if there is to be one.
     endings : sequence of str, default .png, .webp, .pdf, .svg
         What it may end in.
+    what : str, default "picture"
+        What it is called.
 
     Raises
     ------
@@ -67,7 +69,7 @@ def check_picture(path: Path | None, endings: Sequence[str] = PICTURES) -> None:
     """
     if path is not None and path.suffix.lower() not in endings:
         allowed = f"{', '.join(endings[:-1])} or {endings[-1]}"
-        raise UsageError(f"'{path}' is a picture to make; its name must end in {allowed}.")
+        raise UsageError(f"'{path}' is a {what} to make; its name must end in {allowed}.")
     check_output(path)
 
 
@@ -152,8 +154,8 @@ def write_output(path: Path, data: bytes | str) -> None:
         file.write(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
 
-def write_image(path: Path, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
-    """Write a blue-green-red image as PNG or WebP, by the file's ending.
+def write_image(path: Path, image: npt.NDArray[np.uint8 | np.uint16]) -> None:
+    """Write a blue-green-red image, or one of grey, as PNG or WebP, by the file's ending.
 
     Raises
     ------

@@ -12,8 +12,6 @@ import pyarrow as pa
 
 from selective_depth.app import __version__
 from selective_depth.app.console import tables
-from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.output import check_output
 from selective_depth.app.evaluation.evaluate import Outcome, summarise
 from selective_depth.app.evaluation.strategies import strategy_of
 
@@ -66,21 +64,6 @@ def to_json(found: Sequence[Outcome], settings: dict[str, Any]) -> str:
         "frames": [asdict(outcome) for outcome in found],
     }
     return json.dumps(document, indent=1) + "\n"
-
-
-def check_table(path: Path | None) -> None:
-    """Refuse a table that cannot be made, before the work is done.
-
-    Raises
-    ------
-    UsageError
-        If its ending names no known format.
-    OutputError
-        If its folder does not exist.
-    """
-    if path is not None and path.suffix.lower() not in TABLES:
-        raise UsageError(f"'{path}' is a table to make; its name must end in .parquet or .csv.")
-    check_output(path)
 
 
 def write_table(path: Path, found: Sequence[Outcome]) -> None:

@@ -12,7 +12,7 @@ from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.output import check_output, check_picture, write_output
 from selective_depth.app.console.progress import FrameProgress
 from selective_depth.app.evaluation.evaluate import Outcome, Results, frames_of, outcomes, summarise
-from selective_depth.app.evaluation.files import check_table, curves, to_json, write_table
+from selective_depth.app.evaluation.files import TABLES, curves, to_json, write_table
 from selective_depth.app.evaluation.over_time import run_over_time
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategy_of
 from selective_depth.app.pictures import Panel, sheet, write_picture
@@ -68,7 +68,7 @@ def run_evaluation(
     for picture in (files.picture, files.curves):
         check_picture(picture)
     check_output(files.json, files.page)
-    check_table(files.table)
+    check_picture(files.table, TABLES, "table")
     if options.over_time:
         return run_over_time(sources, options, settings, files)
     seeds_shape = settings.seeds.rows, settings.seeds.columns

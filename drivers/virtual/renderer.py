@@ -10,7 +10,7 @@ shape, takes some twenty times as long on these scenes.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -29,8 +29,7 @@ _TORUS_HIT_MM = 0.005
 _TORUS_CLOSE = 0.005  # of the tube's radius: from there on one step of Newton's is exact enough
 
 
-@dataclass(frozen=True, eq=False)
-class Shapes:
+class Shapes(NamedTuple):
     """A scene, one shape per row.
 
     Parameters
@@ -63,8 +62,7 @@ class Shapes:
 
     def beside(self, others: Shapes) -> Shapes:
         """These shapes and others, in the same axes."""
-        names = ("kind", "material", "centre", "first", "second", "size")
-        return Shapes(*(np.concatenate((getattr(self, n), getattr(others, n))) for n in names))
+        return Shapes._make(np.concatenate(pair) for pair in zip(self, others, strict=True))
 
     def seen_from(self, rotation: npt.NDArray[np.float64], position_mm: npt.NDArray[np.float64]) -> Shapes:
         """The same shapes in a camera's axes (x right, y down, z forward).
@@ -76,13 +74,10 @@ class Shapes:
         position_mm : float64 array of shape (3,)
             The camera in the scene.
         """
-        return Shapes(
-            self.kind,
-            self.material,
-            (self.centre - position_mm) @ rotation.T,
-            self.first @ rotation.T,
-            self.second @ rotation.T,
-            self.size,
+        return self._replace(
+            centre=(self.centre - position_mm) @ rotation.T,
+            first=self.first @ rotation.T,
+            second=self.second @ rotation.T,
         )
 
 
@@ -99,39 +94,25 @@ def cast(shapes: Shapes, camera: Camera) -> tuple[npt.NDArray[np.float32], npt.N
     """
     nearness = np.zeros((camera.height, camera.width), np.float32)
     material = np.zeros((camera.height, camera.width), np.uint8)
-    _cast(
-        shapes.kind,
-        shapes.material,
-        shapes.centre,
-        shapes.first,
-        shapes.second,
-        shapes.size,
-        (camera.fx, camera.fy, camera.cx, camera.cy),
-        nearness,
-        material,
-    )
+    _cast(shapes, (camera.fx, camera.fy, camera.cx, camera.cy), nearness, material)
     return nearness, material
 
 
 @njit(cache=True, nogil=True)
-def _cast(kinds, materials, centres, firsts, seconds, sizes, lens, nearness, material):  # type: ignore[no-untyped-def]
-    for i in range(len(kinds)):
-        kind, stuff = kinds[i], np.uint8(materials[i])
-        centre, first, size = centres[i], firsts[i], sizes[i]
+def _cast(shapes, lens, nearness, material):  # type: ignore[no-untyped-def]
+    for i in range(len(shapes.kind)):
+        kind, stuff = shapes.kind[i], np.uint8(shapes.material[i])
+        centre, first, size = shapes.centre[i], shapes.first[i], shapes.size[i]
         if kind == QUAD:
-            _quad(centre, first, seconds[i], size, stuff, lens, nearness, material)
+            _quad(centre, first, shapes.second[i], size, stuff, lens, nearness, material)
             continue
         box = _box(kind, centre, first, size, lens, nearness.shape)
         if box[0] >= box[1] or box[2] >= box[3]:
             continue
-        if kind == SPHERE:
-            _sphere(centre, size, stuff, lens, box, nearness, material)
-        elif kind == CYLINDER:
-            _cylinder(centre, first, size, stuff, lens, box, nearness, material)
-        elif kind == DISC:
-            _disc(centre, first, size, stuff, lens, box, nearness, material)
-        else:
+        if kind == TORUS:
             _torus(centre, first, size, stuff, lens, box, nearness, material)
+        else:
+            _quadric(kind, centre, first, size, stuff, lens, box, nearness, material)
 
 
 @njit(cache=True, nogil=True)
@@ -222,65 +203,39 @@ def _quad(centre, first, second, size, stuff, lens, nearness, material):  # type
 
 
 @njit(cache=True, nogil=True)
-def _sphere(centre, size, stuff, lens, box, nearness, material):  # type: ignore[no-untyped-def]
-    fx, fy, cx, cy = lens
-    power = _dot(centre, centre) - size[0] * size[0]
-    if power <= 0.0:  # the camera is inside
-        return
-    for row in range(box[0], box[1]):
-        y = (row - cy) / fy
-        for column in range(box[2], box[3]):
-            x = (column - cx) / fx
-            along = x * centre[0] + y * centre[1] + centre[2]
-            square = along * along - power * (x * x + y * y + 1.0)
-            if square >= 0.0:
-                q = np.float32((along + math.sqrt(square)) / power)
-                if q > nearness[row, column] and q * NEAREST_MM <= 1.0:
-                    nearness[row, column] = q
-                    material[row, column] = stuff
-
-
-@njit(cache=True, nogil=True)
-def _cylinder(centre, axis, size, stuff, lens, box, nearness, material):  # type: ignore[no-untyped-def]
+def _quadric(kind, centre, axis, size, stuff, lens, box, nearness, material):  # type: ignore[no-untyped-def]
+    """A sphere, a cylinder or a disc: in q their equations are quadratic, a disc's linear."""
     fx, fy, cx, cy = lens
     depth_of_axis = _dot(centre, axis)
-    power = _dot(centre, centre) - depth_of_axis * depth_of_axis - size[0] * size[0]
-    if power <= 0.0:  # the camera is within the endless cylinder and sees an end first
+    power = _dot(centre, centre) - size[0] * size[0]
+    if kind == CYLINDER:
+        power -= depth_of_axis * depth_of_axis
+    if kind == DISC:
+        if abs(depth_of_axis) < 1e-6:  # edge on
+            return
+    elif power <= 0.0:  # the camera is inside; of an endless cylinder, and sees an end first
         return
     for row in range(box[0], box[1]):
         y = (row - cy) / fy
         for column in range(box[2], box[3]):
             x = (column - cx) / fx
             on_axis = x * axis[0] + y * axis[1] + axis[2]
-            along = x * centre[0] + y * centre[1] + centre[2] - on_axis * depth_of_axis
-            square = along * along - power * (x * x + y * y + 1.0 - on_axis * on_axis)
-            if square >= 0.0:
+            if kind == DISC:
+                q = on_axis / depth_of_axis
+                dx, dy, dz = x - q * centre[0], y - q * centre[1], 1.0 - q * centre[2]
+                seen = (size[1] * q) ** 2 <= dx * dx + dy * dy + dz * dz <= (size[0] * q) ** 2
+            else:
+                along, square = x * centre[0] + y * centre[1] + centre[2], x * x + y * y + 1.0
+                if kind == CYLINDER:
+                    along -= on_axis * depth_of_axis
+                    square -= on_axis * on_axis
+                square = along * along - power * square
+                if square < 0.0:
+                    continue
                 q = (along + math.sqrt(square)) / power
-                inside = abs(on_axis - q * depth_of_axis) <= size[1] * q
-                near = np.float32(q)
-                if inside and near > nearness[row, column] and q * NEAREST_MM <= 1.0:
-                    nearness[row, column] = near
-                    material[row, column] = stuff
-
-
-@njit(cache=True, nogil=True)
-def _disc(centre, axis, size, stuff, lens, box, nearness, material):  # type: ignore[no-untyped-def]
-    fx, fy, cx, cy = lens
-    offset = _dot(centre, axis)
-    if abs(offset) < 1e-6:  # edge on
-        return
-    for row in range(box[0], box[1]):
-        y = (row - cy) / fy
-        for column in range(box[2], box[3]):
-            x = (column - cx) / fx
-            q = (x * axis[0] + y * axis[1] + axis[2]) / offset
-            if q <= 0.0:
-                continue
-            dx, dy, dz = x - q * centre[0], y - q * centre[1], 1.0 - q * centre[2]
-            square = dx * dx + dy * dy + dz * dz
-            ring = (size[1] * q) ** 2 <= square <= (size[0] * q) ** 2
+                seen = kind == SPHERE or abs(on_axis - q * depth_of_axis) <= size[1] * q
             near = np.float32(q)
-            if ring and near > nearness[row, column] and q * NEAREST_MM <= 1.0:
+            if seen and near > nearness[row, column] and q * NEAREST_MM <= 1.0:
                 nearness[row, column] = near
                 material[row, column] = stuff
 

@@ -18,7 +18,6 @@ NEGLIGIBLE = 1e-8
 the result is that of moving every node at every step; at 1e-3 it is another, equally good one."""
 
 _MEMBERS = 16  # nodes per group; the nearest members of all groups are found in one sweep
-_FEW = 32  # up to here, ordering by comparing all with all is the faster way
 _SLACK = 1.2  # how much farther than expected the nodes that move are looked for
 _FAR = 1e18  # where the padding of the last groups lies: its square is still finite
 
@@ -141,19 +140,6 @@ def _within(d2, nearest, reach, found, key):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
-def _order_few(key, count, order):  # type: ignore[no-untyped-def]
-    """Order by counting the smaller keys: quadratic, but free of branches."""
-    for i in range(count):
-        own = key[i]
-        rank = 0
-        for j in range(i):
-            rank += int(key[j] <= own)
-        for j in range(i + 1, count):
-            rank += int(key[j] < own)
-        order[rank] = i
-
-
 @njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz", "contract"})
 def _largest(key, count, lanes):  # type: ignore[no-untyped-def]
     """Largest of the keys, in as many lanes as `lanes` is long, so that it is vectorised."""
@@ -173,7 +159,7 @@ def _largest(key, count, lanes):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _order_many(key, count, largest, order, spare, starts):  # type: ignore[no-untyped-def]
+def _order(key, count, largest, order, spare, starts):  # type: ignore[no-untyped-def]
     """Order by two passes of a radix sort, over distance and place packed into 32 bits."""
     one = np.uint32(1)
     place_bits = one
@@ -333,8 +319,7 @@ def _anneal(points, nodes, count, draws, lambda_first):  # type: ignore[no-untyp
         _weights(alpha, math.exp(-1 / range_), weight, moving)
         if moving > count // 2:
             # Most nodes move: order them all, without looking for those in reach.
-            largest = _largest(flat_d2, count, lanes)
-            _order_many(flat_d2, count, largest, order, spare, starts)
+            _order(flat_d2, count, _largest(flat_d2, count, lanes), order, spare, starts)
             for k in range(moving):
                 flat_share[order[k]] = weight[k]
             for k in range(moving, count):
@@ -348,11 +333,7 @@ def _anneal(points, nodes, count, draws, lambda_first):  # type: ignore[no-untyp
         while have < moving:
             reach = reach * 1.5 + 1e-6
             have = _within(d2, nearest, reach, found, key)
-        if have > _FEW:
-            largest = _largest(key, have, lanes)
-            _order_many(key, have, largest, order, spare, starts)
-        else:
-            _order_few(key, have, order)
+        _order(key, have, _largest(key, have, lanes), order, spare, starts)
         reaches[p] = key[order[moving - 1]] / moving
         for k in range(moving):
             i = found[order[k]]
