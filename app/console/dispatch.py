@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import shutil
@@ -121,6 +122,8 @@ def sentence_of(error: Exception) -> str:
     from selective_depth.drivers.errors import SourceError
 
     words = " ".join(str(error).split())
+    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        return "too many files are open at once. Raise the limit, as with 'ulimit -n 1024', and run it again."
     if isinstance(error, (AppError, SourceError, ValueError, OSError)) and words:
         return words
     return (

@@ -12,6 +12,9 @@ import pytest
 from jupyter_client.manager import KernelManager
 from virtual_sensor import VirtualSensor
 
+from selective_depth.drivers.errors import SourceNotFoundError
+from selective_depth.drivers.open import open_source
+
 RUN = ("replay", "virtual:ball?size=160x120&frames=3", "--headless", "--seeds.rows", "24", "--seeds.columns", "32")
 
 
@@ -83,3 +86,16 @@ def test_in_a_jupyter_kernel(virtual_sensor: VirtualSensor, tmp_path: Path) -> N
     finally:
         client.stop_channels()
         manager.shutdown_kernel(now=True)
+
+
+def test_few_descriptors_end_in_a_sentence(tmp_path: Path) -> None:
+    script = f"ulimit -n 12; exec {sys.executable} -m selective_depth.app {' '.join(map(repr, RUN))}"
+    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert "too many files are open at once" in done.stderr and "ulimit -n" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["a" * 5000, "x\0y", "a" * 300 + ".oni"])
+def test_a_name_that_no_file_can_have_is_a_named_error(name: str) -> None:
+    with pytest.raises(SourceNotFoundError, match=r"cannot be the name of a file|does not exist"):
+        open_source(name)
