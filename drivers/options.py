@@ -21,7 +21,11 @@ def appended(uri: str, given: dict[str, str]) -> str:
 
 def parted(uri: str) -> tuple[str, str]:
     """A source's name without its options, and these; what exists under the whole name has none."""
-    name, _, options = (uri, "", "") if Path(uri).exists() else uri.partition("?")
+    try:
+        name, _, options = (uri, "", "") if Path(uri).exists() else uri.partition("?")
+        Path(name).exists()
+    except (OSError, ValueError) as error:  # too long, or with a null byte
+        raise SourceNotFoundError(f"'{uri:.60}…' cannot be the name of a file ({error!s:.40}…).") from None
     return name, options
 
 

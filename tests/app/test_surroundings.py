@@ -89,7 +89,7 @@ def test_in_a_jupyter_kernel(virtual_sensor: VirtualSensor, tmp_path: Path) -> N
 
 
 def test_few_descriptors_end_in_a_sentence(tmp_path: Path) -> None:
-    script = f"ulimit -n 12; exec {sys.executable} -m selective_depth.app {' '.join(map(repr, RUN))}"
+    script = f"ulimit -n 12; exec {sys.executable} -m selective_depth.app {' '.join(map(repr, RUN))} --save x.rrd"
     done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     assert "too many files are open at once" in done.stderr and "ulimit -n" in done.stderr
