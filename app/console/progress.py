@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 PATIENCE_S = 2.0
 """A wait longer than this is explained."""
@@ -43,48 +43,41 @@ class FrameProgress:
     """
 
     def __init__(self, what: str, total: int | None) -> None:
-        self._what = what
-        self._total = total
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
+        self._what, self._total = what, total
         self._start_s = self._said_s = time.monotonic()
-        if sys.stderr.isatty():
-            self._bar = Progress(
-                SpinnerColumn(),
-                TextColumn("{task.description}"),
-                *((BarColumn(),) if total else ()),
-                MofNCompleteColumn(),
-                TextColumn("frames"),
-                TimeElapsedColumn(),
-                TextColumn("{task.fields[note]}"),
-                console=Console(stderr=True),
-                transient=True,
-            )
-            self._task = self._bar.add_task(what, total=total, note="")
+        self._drawn = sys.stderr.isatty()
+        self._bar = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            *((BarColumn(),) if total else ()),
+            MofNCompleteColumn(),
+            TextColumn("frames"),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=Console(stderr=True),
+            transient=True,
+            disable=not self._drawn,
+        )
+        self._task = self._bar.add_task(what, total=total, note="")
 
     def update(self, frames: int, note: str = "") -> None:
         """Show the number of frames done and a note, such as the sensor's state."""
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=frames, note=note)
-            return
+        self._bar.update(self._task, completed=frames, note=note)
         now = time.monotonic()
-        if now - self._start_s > PATIENCE_S and (self._said_s == self._start_s or now - self._said_s > REPEAT_S):
+        due_s = PATIENCE_S if self._said_s == self._start_s else REPEAT_S
+        if not self._drawn and now - self._said_s > due_s:
             self._said_s = now
             total = f" of {self._total}" if self._total else ""
             sys.stderr.write(f"{self._what}: {frames}{total} frames {note}".rstrip() + "\n")
 
     def say(self, sentence: str) -> None:
         """Tell something at once, above the bar."""
-        if self._bar is not None:
-            self._bar.console.print(sentence, highlight=False)
-        else:
-            sys.stderr.write(f"{sentence}\n")
+        self._bar.console.print(sentence, markup=False, highlight=False, soft_wrap=not self._drawn)
 
     def __enter__(self) -> Self:
-        if self._bar is not None:
-            self._bar.start()
+        self._bar.start()
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if self._bar is not None:
+        if self._drawn:  # else it would end a line that it has not begun
             self._bar.stop()

@@ -24,7 +24,7 @@ semivariogram come out of y as well: with x = Z - mean Z,
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +36,7 @@ SEEDS = 9
 """Seeds in a window without holes."""
 CONTRASTS = SEEDS - 1
 """Dimensions of a window's system once the mean is taken out."""
+_ONE_OF_EACH = ("between", "basis", "eigenvalues", "distance_sums", "moments")  # a geometry
 
 
 class LatticeTables(NamedTuple):
@@ -84,11 +85,6 @@ class LatticeTables(NamedTuple):
     distance_sums: Floats
     moments: Floats
 
-    @property
-    def bytes(self) -> int:
-        """Memory that the tables take."""
-        return sum(array.nbytes for array in self)
-
 
 def build_tables(geometries: list[tuple[int, int, int, int]], exponent: float) -> LatticeTables:
     """Tabulate window geometries.
@@ -101,32 +97,18 @@ def build_tables(geometries: list[tuple[int, int, int, int]], exponent: float) -
         The w of eq. (24), in (0, 2).
     """
     parts = [_tabulate(*geometry, exponent) for geometry in geometries]
-    pixels = [len(part["is_seed"]) for part in parts]
-    pairs = [len(part["bases"]) for part in parts]
-
-    def joined(name: str, axis: int = 0) -> Floats:
-        whole = np.concatenate([part[name] for part in parts], axis=axis)
-        kept = aligned_empty(*whole.shape)
-        kept[...] = whole
-        return kept
-
-    def stacked(name: str) -> Floats:
-        return np.ascontiguousarray(np.stack([part[name] for part in parts]), np.float32)
-
-    return LatticeTables(
-        first_pixel=np.concatenate(([0], np.cumsum(pixels)[:-1])).astype(np.int64),
-        first_pair=np.concatenate(([0], np.cumsum(pairs)[:-1])).astype(np.int64),
-        distances=joined("distances", axis=1),
-        between=np.ascontiguousarray(np.stack([part["between"] for part in parts]), np.float64),
-        vectors=joined("vectors"),
-        is_seed=np.concatenate([part["is_seed"] for part in parts]).astype(np.bool_),
-        products=joined("products"),
-        bases=joined("bases"),
-        basis=stacked("basis"),
-        eigenvalues=stacked("eigenvalues"),
-        distance_sums=stacked("distance_sums"),
-        moments=stacked("moments"),
-    )
+    tables: dict[str, npt.NDArray[Any]] = {}
+    for name in parts[0]:
+        arrays = [part[name] for part in parts]
+        if name in _ONE_OF_EACH:
+            whole = np.stack(arrays)
+        else:
+            whole = np.concatenate(arrays, axis=1 if name == "distances" else 0)
+        tables[name] = whole if name in ("between", "is_seed") else aligned_empty(*whole.shape)
+        tables[name][...] = whole
+    for name, table in (("first_pixel", "is_seed"), ("first_pair", "bases")):
+        tables[name] = np.cumsum([0, *(len(part[table]) for part in parts[:-1])])
+    return LatticeTables(**tables)
 
 
 def _tabulate(up: int, down: int, left: int, right: int, exponent: float) -> dict[str, npt.NDArray[np.generic]]:

@@ -187,16 +187,12 @@ class Windows:
         return padded_pixels(width, height)
 
 
-def _pitch(pixels: int, count: int) -> float:
-    return pixels / count if count > 1 else 0.0
-
-
 @lru_cache(maxsize=8)
 def _windows(frame_shape: tuple[int, int], rows: bytes, columns: bytes, exponent: float) -> Windows:
     height, width = frame_shape
     at_rows, at_columns = np.frombuffer(rows, np.int32), np.frombuffer(columns, np.int32)
-    pitch = max(_pitch(height, len(at_rows)), _pitch(width, len(at_columns))) or LONE_PITCH
-    reach_px = REACH * pitch
+    axes = (height, at_rows), (width, at_columns)
+    reach_px = REACH * max((pixels / len(at) for pixels, at in axes if len(at) > 1), default=LONE_PITCH)
     row_axis = Axis.of(height, at_rows, reach_px)
     column_axis = Axis.of(width, at_columns, reach_px)
     widest = max(row_axis.longest, column_axis.longest)

@@ -18,6 +18,9 @@ NEAR_PX = 2
 """The range of the model is taken over so many pixels about one, and a contradiction is confirmed
 so far from it: outlines wobble by two pixels."""
 
+BESIDE = NEAR_PX * np.array([(-1, 0), (1, 0), (0, -1), (0, 1)], np.int32)
+"""Offsets of the four pixels about a contradiction, column first."""
+
 MARGIN_PX = 7
 """Forgotten about what has changed: without it slivers stay behind a thing that moves, and the
 error doubles within 40 frames."""
@@ -87,8 +90,7 @@ def drift(uv: Ints, depth_mm: Floats, model_mm: Floats, noise_mm: Floats) -> flo
 
 def around(uv: Ints, shape: tuple[int, int]) -> Ints:
     """The four pixels `NEAR_PX` beside each, those that lie inside the frame, each once."""
-    offsets = NEAR_PX * np.array([(-1, 0), (1, 0), (0, -1), (0, 1)], np.int32)
-    beside = (uv[:, None] + offsets).reshape(-1, 2)
+    beside = (uv[:, None] + BESIDE).reshape(-1, 2)
     inside = ((beside >= 0) & (beside < (shape[1], shape[0]))).all(axis=1)
     found: Ints = np.unique(beside[inside], axis=0)
     return found

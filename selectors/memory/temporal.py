@@ -18,7 +18,16 @@ from selective_depth.drivers.frame import Camera
 from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.arrays import Bools, Bytes, Floats, Ints, pixels_where
 from selective_depth.selectors.choice import choose
-from selective_depth.selectors.memory.change import MARGIN_PX, MOVED, NEAR_PX, Extent, around, contradicts, drift
+from selective_depth.selectors.memory.change import (
+    BESIDE,
+    MARGIN_PX,
+    MOVED,
+    NEAR_PX,
+    Extent,
+    around,
+    contradicts,
+    drift,
+)
 from selective_depth.selectors.memory.store import Memory, book, forget
 from selective_depth.selectors.memory.worth import WRONG, Noise, shot_worth
 from selective_depth.selectors.parallel import in_bands
@@ -279,18 +288,19 @@ class TemporalAcquisition:
             return False
         if not against.any():
             return True
-        beside = around(uv[against], self.shape)[: self._shots - sensor.spent]
-        beside_against = contradicts(beside, sensor(beside), model_mm)
-        extent = Extent(self.shape)
         doubted = uv[against]
+        beside = around(doubted, self.shape)[: self._shots - sensor.spent]
+        beside_against = contradicts(beside, sensor(beside), model_mm)
         votes = np.zeros(self.shape, np.uint8)
         votes[beside[beside_against, 1], beside[beside_against, 0]] = 1
-        confirmed = _votes_about(doubted, votes) >= FEWEST_CONFIRMED
-        extent.add(uv[~against], np.zeros(int((~against).sum()), np.bool_))
-        extent.add(beside, beside_against & bool(confirmed.any()))
-        extent.add(doubted, confirmed)
+        at = doubted[:, None] + BESIDE + NEAR_PX
+        confirmed = np.pad(votes, NEAR_PX)[at[..., 1], at[..., 0]].sum(axis=1) >= FEWEST_CONFIRMED
         if not confirmed.any():
             return True
+        extent = Extent(self.shape)
+        extent.add(uv, against)
+        extent.add(beside, beside_against)
+        extent.add(doubted, confirmed)
         for left in range(EXTENT_ROUNDS, 0, -1):
             _, border_px = extent.changed()
             shots = (self._shots - sensor.spent) // (left + 1)
@@ -342,12 +352,3 @@ class TemporalAcquisition:
             shots -= shots // 2
         sensor(choose(worth, shots, threads=self._threads))
         self._book(sensor, first)
-
-
-def _votes_about(uv: Ints, votes: Bytes) -> npt.NDArray[np.integer]:
-    """How many of the pixels measured beside each contradicted, shape (n,)."""
-    padded = np.pad(votes, NEAR_PX)
-    u, v = uv[:, 0] + NEAR_PX, uv[:, 1] + NEAR_PX
-    beside = ((v, u - NEAR_PX), (v, u + NEAR_PX), (v - NEAR_PX, u), (v + NEAR_PX, u))
-    votes_for: npt.NDArray[np.integer] = np.sum([padded[at] for at in beside], axis=0)
-    return votes_for
