@@ -17,13 +17,11 @@ from selective_depth.app.settings import (
     AcquireOptions,
     BatchOptions,
     Flag,
-    GasOptions,
-    ImprovementOptions,
     Limit,
     Natural,
     PictureOptions,
     Positive,
-    SeedOptions,
+    SelectorOptions,
     Settings,
     Source,
     SourceOrSample,
@@ -43,7 +41,9 @@ EXAMPLES = (
 Options = Annotated[Settings, arg(name="")]
 Acquiring = Annotated[AcquireOptions, arg(name="")]
 Page = Annotated[PictureOptions, arg(name="")]
-DEFAULTS, PAGE, MODEL, BATCH = Settings(), PictureOptions(), AcquireOptions(budget=0.05, rounds=8), BatchOptions()
+Selectors = Annotated[SelectorOptions, arg(name="")]
+DEFAULTS, SELECTORS, PAGE, BATCH = Settings(), SelectorOptions(), PictureOptions(), BatchOptions()
+MODEL = AcquireOptions(budget=0.05, rounds=8)
 SCENES = ("virtual:workstation", "virtual:ball", "virtual:firehose")
 
 
@@ -198,9 +198,7 @@ def batch(
     /,
     out: Annotated[Path, arg(metavar="DIR")],
     options: Annotated[BatchOptions, arg(name="")] = BATCH,
-    seeds: SeedOptions = DEFAULTS.seeds,
-    gas: GasOptions = DEFAULTS.gas,
-    improvement: ImprovementOptions = DEFAULTS.improvement,
+    selectors: Selectors = SELECTORS,
     acquire: Acquiring = DEFAULTS.acquire,
 ) -> int:
     """Run every recording of an archive through both selectors: a table each, and a summary.
@@ -215,13 +213,12 @@ def batch(
         Folder for the tables, made if need be.
     options
         What is kept, and who does the work.
-    seeds, gas, improvement, acquire
+    selectors, acquire
         Options of the selectors.
     """
     from selective_depth.app.commands.batch import run_batch
 
-    settings = Settings(seeds=seeds, gas=gas, improvement=improvement, acquire=acquire)
-    return run_batch(sources, out, options, settings)
+    return run_batch(sources, out, options, Settings(**vars(selectors), acquire=acquire))
 
 
 @command("Files", (f"{PROGRAM} model frames/ model --frame 30 --budget 0.05", "a cloud, its depth, its samples"))
@@ -230,9 +227,7 @@ def model(
     out: Annotated[Path, arg(metavar="DIR")],
     /,
     frame: Natural = 0,
-    seeds: SeedOptions = DEFAULTS.seeds,
-    gas: GasOptions = DEFAULTS.gas,
-    improvement: ImprovementOptions = DEFAULTS.improvement,
+    selectors: Selectors = SELECTORS,
     acquire: Acquiring = MODEL,
 ) -> int:
     """Acquire one frame selectively and save the model: cloud.ply, depth.png, samples.npz.
@@ -245,12 +240,12 @@ def model(
         Folder for the three files.
     frame : int
         Which frame, from 0.
-    seeds, gas, improvement, acquire
+    selectors, acquire
         Options of the acquisition and of the selector that drives it.
     """
     from selective_depth.app.commands.model import model_frame
 
-    settings = Settings(seeds=seeds, gas=gas, improvement=improvement, acquire=acquire)
+    settings = Settings(**vars(selectors), acquire=acquire)
     return model_frame(source, out, frame, settings)
 
 
@@ -288,9 +283,7 @@ def snapshot(
     /,
     out: Annotated[Path, arg(metavar="DIR")] = Path("snapshot"),
     frame: Natural = 0,
-    seeds: SeedOptions = DEFAULTS.seeds,
-    gas: GasOptions = DEFAULTS.gas,
-    improvement: ImprovementOptions = DEFAULTS.improvement,
+    selectors: Selectors = SELECTORS,
     acquire: Acquiring = DEFAULTS.acquire,
     page: Page = PAGE,
 ) -> int:
@@ -304,14 +297,14 @@ def snapshot(
         Folder for the sheet and every panel as .png; or a picture, for the sheet alone.
     frame : int
         Which frame of each source, from 0.
-    seeds, gas, improvement, acquire
+    selectors, acquire
         Options of the selectors.
     page
         The page.
     """
     from selective_depth.app.commands.snapshot import draw_snapshot
 
-    settings = Settings(seeds=seeds, gas=gas, improvement=improvement, acquire=acquire)
+    settings = Settings(**vars(selectors), acquire=acquire)
     return draw_snapshot(sources, frame, out, settings, page)
 
 
@@ -327,9 +320,7 @@ def figure(
     out: Annotated[Path | None, optional("FILE")] = None,
     save: Annotated[Path | None, optional("FILE.rrd")] = None,
     frame: Natural = 0,
-    seeds: SeedOptions = DEFAULTS.seeds,
-    gas: GasOptions = DEFAULTS.gas,
-    improvement: ImprovementOptions = DEFAULTS.improvement,
+    selectors: Selectors = SELECTORS,
     page: Page = PAGE,
 ) -> int:
     """Make a figure of the paper, on the virtual scenes or on any source.
@@ -349,14 +340,14 @@ def figure(
         Write the trainings of figure 1 to a Rerun recording as well, by epoch.
     frame : int
         Which frame of each source, from 0.
-    seeds, gas, improvement
-        Options of the selectors.
+    selectors
+        Their options.
     page
         The page.
     """
     from selective_depth.app.commands.paper import draw_figure
 
-    settings = Settings(seeds=seeds, gas=gas, improvement=improvement)
+    settings = Settings(**vars(selectors))
     return draw_figure(number, sources or SCENES, out, frame, settings, page, save)
 
 

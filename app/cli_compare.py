@@ -12,11 +12,9 @@ from selective_depth.app.settings import (
     ComparisonOptions,
     EvaluationFiles,
     Flag,
-    GasOptions,
-    ImprovementOptions,
     Limit,
     PictureOptions,
-    SeedOptions,
+    SelectorOptions,
     Settings,
     Source,
     SourceOrSample,
@@ -26,7 +24,8 @@ from selective_depth.app.settings import (
 Page = Annotated[PictureOptions, arg(name="")]
 Files = Annotated[EvaluationFiles, arg(name="")]
 Compared = Annotated[ComparisonOptions, arg(name="")]
-PAGE, FILES, COMPARED, DEFAULTS = (PictureOptions(), EvaluationFiles(), ComparisonOptions(), Settings())
+Selectors = Annotated[SelectorOptions, arg(name="")]
+PAGE, FILES, COMPARED, SELECTORS = PictureOptions(), EvaluationFiles(), ComparisonOptions(), SelectorOptions()
 
 
 @command(
@@ -101,9 +100,7 @@ def evaluate(
     sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
     comparison: Compared = COMPARED,
-    seeds: SeedOptions = DEFAULTS.seeds,
-    gas: GasOptions = DEFAULTS.gas,
-    improvement: ImprovementOptions = DEFAULTS.improvement,
+    selectors: Selectors = SELECTORS,
     files: Files = FILES,
     page: Page = PAGE,
 ) -> None:
@@ -115,10 +112,8 @@ def evaluate(
         Recordings, folders or scenes, as for replay.
     comparison
         What is compared on what.
-    seeds
-        The seed lattice.
-    gas, improvement
-        Options of the two published selectors.
+    selectors
+        The seed lattice, and options of the two published selectors.
     files
         What is written.
     page
@@ -126,5 +121,4 @@ def evaluate(
     """
     from selective_depth.app.evaluation.report import run_evaluation
 
-    settings = Settings(seeds=seeds, gas=gas, improvement=improvement)
-    run_evaluation(sources, comparison, settings, files=files, page=page)
+    run_evaluation(sources, comparison, Settings(**vars(selectors)), files=files, page=page)

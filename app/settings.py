@@ -132,6 +132,15 @@ class ImprovementOptions:
 
 
 @dataclass(frozen=True)
+class SelectorOptions:
+    """The seeds, and the two published selectors."""
+
+    seeds: SeedOptions = field(default_factory=SeedOptions)
+    gas: GasOptions = field(default_factory=GasOptions)
+    improvement: ImprovementOptions = field(default_factory=ImprovementOptions)
+
+
+@dataclass(frozen=True)
 class AcquireOptions:
     """Spending a budget of further measurements."""
 
@@ -265,12 +274,9 @@ class EvaluationFiles:
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(SelectorOptions):
     """All options of a run."""
 
-    seeds: SeedOptions = field(default_factory=SeedOptions)
-    gas: GasOptions = field(default_factory=GasOptions)
-    improvement: ImprovementOptions = field(default_factory=ImprovementOptions)
     acquire: Annotated[AcquireOptions, arg(name="")] = field(default_factory=AcquireOptions)
     run: Annotated[RunOptions, arg(name="")] = field(default_factory=RunOptions)
     viewer: Annotated[ViewerOptions, arg(name="")] = field(default_factory=ViewerOptions)

@@ -78,19 +78,10 @@ def write_table(path: Path, found: Sequence[Outcome]) -> None:
     OutputError
         If it cannot be written; an older file stays as it was.
     """
-    rows = [
-        {
-            "source": outcome.source,
-            "index": outcome.index,
-            "budget": outcome.budget,
-            "measured": outcome.measured,
-            "strategy": outcome.strategy,
-            "draw": draw,
-            **asdict(errors),
-        }
-        for outcome in found
-        for draw, errors in enumerate(outcome.errors)
-    ]
+    rows = []
+    for outcome in found:
+        what = {name: getattr(outcome, name) for name in ("source", "index", "budget", "measured", "strategy")}
+        rows += [what | {"draw": draw} | asdict(errors) for draw, errors in enumerate(outcome.errors)]
     tables.write_table(path, pa.Table.from_pylist(rows), SCHEMA)
 
 

@@ -169,6 +169,7 @@ def run_over_time(
         If a file cannot be written.
     """
     check_named(sources, options.budget)
+    budget, seeds_shape = float(options.budget[0]), (settings.seeds.rows, settings.seeds.columns)
     found: dict[str, dict[str, Course]] = {}
     last: list[tuple[DepthFrame, TemporalStep]] = []
     for uri in sources:
@@ -179,21 +180,16 @@ def run_over_time(
                 last[:] = [(frame, step)]
 
             found[uri] = over_time(
-                uri,
-                float(options.budget[0]),
-                frames=options.frames,
-                seeds_shape=(settings.seeds.rows, settings.seeds.columns),
-                rounds=options.rounds,
-                each=each,
+                uri, budget, frames=options.frames, seeds_shape=seeds_shape, rounds=options.rounds, each=each
             )
-        _print(uri, found[uri], float(options.budget[0]))
+        _print(uri, found[uri], budget)
         if files.picture is not None and len(found) == 1:
             write_picture(files.picture, _picture(*last[0]))
             say(f"wrote {files.picture}")
     if files.json is not None:
         document = {
             "over_time": {uri: {way: asdict(course) for way, course in ways.items()} for uri, ways in found.items()},
-            "budget": options.budget[0],
+            "budget": budget,
         }
         write_output(files.json, json.dumps(document, indent=1) + "\n")
         say(f"wrote {files.json}")

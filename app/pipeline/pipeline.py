@@ -208,12 +208,7 @@ class Pipeline:
             return None, None
         with self.times.stage("acquire", stages_ms):
             acquisition = acquire(
-                frame.measure,
-                seeds,
-                options.budget,
-                rounds=options.rounds,
-                selector=self._selector,
-                threads=self._threads,
+                frame.measure, seeds, options.budget, options.rounds, self._selector, threads=self._threads
             )
         model = None if self._realtime else self._model(frame, acquisition, stages_ms)
         return acquisition, model

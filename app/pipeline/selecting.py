@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +23,9 @@ NAMES = ("auto", "surface", "step", "improvement", "neural-gas", "neural-gas-edg
 
 def gas_of(settings: Settings, threads: int | None) -> NeuralGasSelector:
     """The neural gas that the options describe."""
-    gas = settings.gas
-    return NeuralGasSelector(
-        nodes=gas.nodes,
-        epochs=gas.epochs,
-        algorithm=gas.algorithm,
-        seed=gas.seed,
-        edge_metric=gas.edge_metric,
-        factor=gas.factor,
-        threads=threads,
-    )
+    options = asdict(settings.gas)
+    del options["training"]  # of the frames after the first, which the pipeline sees to
+    return NeuralGasSelector(**options, threads=threads)
 
 
 def improvement_of(settings: Settings, threads: int | None) -> ImprovementSelector:
@@ -58,21 +53,16 @@ def selector_of(settings: Settings, threads: int | None) -> Selector | Worth:
         If there is no such selector.
     """
     by = settings.acquire.by
-    if by == "auto":
-        return best_selector(settings.acquire.rounds, threads)
-    if by == "surface":
-        return SurfaceSelector(threads=threads)
-    if by == "step":
-        return StepSelector(threads=threads)
-    if by == "improvement":
-        return improvement_of(settings, threads)
-    if by == "neural-gas":
-        return gas_of(settings, threads)
-    if by == "neural-gas-edges":
-        return LongEdgeSelector(gas_of(settings, threads))
-    if by == "even":
-        return EvenSelector()
-    return _of_ones_own(by)
+    makers: dict[str, Callable[[], Selector]] = {
+        "auto": lambda: best_selector(settings.acquire.rounds, threads),
+        "surface": lambda: SurfaceSelector(threads=threads),
+        "step": lambda: StepSelector(threads=threads),
+        "improvement": lambda: improvement_of(settings, threads),
+        "neural-gas": lambda: gas_of(settings, threads),
+        "neural-gas-edges": lambda: LongEdgeSelector(gas_of(settings, threads)),
+        "even": EvenSelector,
+    }
+    return makers[by]() if by in makers else _of_ones_own(by)
 
 
 def _of_ones_own(by: str) -> Selector | Worth:

@@ -8,7 +8,7 @@ known that was not asked for.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,7 @@ from selective_depth.selectors.memory.change import (
 from selective_depth.selectors.memory.store import Memory, book, forget
 from selective_depth.selectors.memory.worth import WRONG, Noise, shot_worth
 from selective_depth.selectors.parallel import in_bands
-from selective_depth.selectors.samples import Samples
+from selective_depth.selectors.samples import REACH, Samples, seed_pitch_px
 from selective_depth.selectors.seeds import Measure, SeedGrid, answers
 from selective_depth.selectors.selection import Selector, Worth, plan_of
 from selective_depth.selectors.triangulation import Surface
@@ -133,6 +133,7 @@ class _Sensor:
         return sum(map(len, self.uv))
 
 
+@dataclass(eq=False)
 class TemporalAcquisition:
     """Acquire frame after frame, and remember.
 
@@ -175,41 +176,35 @@ class TemporalAcquisition:
     (246, True)
     """
 
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        *,
-        budget: float = 0.02,
-        first_budget: float = 0.05,
-        seeds: tuple[int, int] = (128, 128),
-        rounds: int = 4,
-        selector: Selector | Worth | None = None,
-        noise: Noise | None = None,
-        camera: Camera | None = None,
-        threads: int | None = None,
-    ) -> None:
-        self.shape = shape
-        self._shots = shots_of(budget, shape)
-        self._first_shots = shots_of(first_budget, shape)
-        self._rounds = rounds
-        self._selector = selector
-        self._noise = noise or Noise()
-        self._threads = threads
-        self._grid = SeedGrid.from_array(np.zeros(shape, np.uint16), seeds, camera=camera)
+    shape: tuple[int, int]
+    _: KW_ONLY
+    budget: float = 0.02
+    first_budget: float = 0.05
+    seeds: tuple[int, int] = (128, 128)
+    rounds: int = 4
+    selector: Selector | Worth | None = None
+    noise: Noise = field(default_factory=Noise)
+    camera: Camera | None = None
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        self._shots = shots_of(self.budget, self.shape)
+        self._first_shots = shots_of(self.first_budget, self.shape)
+        self._grid = SeedGrid.from_array(np.zeros(self.shape, np.uint16), self.seeds, camera=self.camera)
         lattice = self._grid.lattice_uv.reshape(-1, 2)
         # In an order of which every part is spread over the frame.
         self._lattice_uv = lattice[np.random.default_rng(0).permutation(len(lattice))]
         self._looked = 0
-        pitch_px = max(n / cells for n, cells in zip(shape, seeds, strict=True))
-        self._reach_sq = (1.3 * pitch_px) ** 2
+        self._pitch_px = seed_pitch_px(self._grid)
+        self._reach_sq = (REACH * self._pitch_px) ** 2
         self._frame = -1
         self._alert = 0
         # Where a frame's budget does not pay for a fresh start, the memory is relied on at once.
-        affordable = self._shots >= seeds[0] * seeds[1] + self._first_shots
+        affordable = self._shots >= len(lattice) + self._first_shots
         self._probation = PROBATION if affordable else 0
         self._still = 0
-        self._memory = Memory.of(shape)
-        self._surface = Surface(shape, threads)
+        self._memory = Memory.of(self.shape)
+        self._surface = Surface(self.shape, self.threads)
         self._by = ""
 
     def step(self, measure: Measure) -> TemporalStep:
@@ -245,7 +240,7 @@ class TemporalAcquisition:
                 self._alert = ALERT_FRAMES
                 forget(self._memory, changed)
             self._book(sensor, 0, anew=bool(changed.any()))
-            rounds = self._rounds if changed.any() else 1
+            rounds = self.rounds if changed.any() else 1
             for left in range(rounds, 0, -1):
                 self._measure_best(sensor, (self._shots - sensor.spent) // left)
         if model_mm is None:
@@ -283,7 +278,7 @@ class TemporalAcquisition:
         model_mm = self._surface.layers.depth_mm
         against = contradicts(uv, mm, model_mm)
         z = model_mm[uv[:, 1], uv[:, 0]]
-        noise_mm = self._noise.floor_mm + self._noise.per_mm * z * z
+        noise_mm = self.noise.floor_mm + self.noise.per_mm * z * z
         if drift(uv, mm, model_mm, noise_mm) > MOVED:
             return False
         if not against.any():
@@ -304,7 +299,7 @@ class TemporalAcquisition:
         for left in range(EXTENT_ROUNDS, 0, -1):
             _, border_px = extent.changed()
             shots = (self._shots - sensor.spent) // (left + 1)
-            new = sensor.unasked(choose(border_px, shots, threads=self._threads))
+            new = sensor.unasked(choose(border_px, shots, threads=self.threads))
             extent.add(new, contradicts(new, sensor(new), model_mm))
         where, _ = extent.changed()
         changed[:] = maximum_filter(where, 2 * MARGIN_PX + 1)
@@ -315,11 +310,11 @@ class TemporalAcquisition:
         seeds = SeedGrid.measured(sensor, self.shape, self._grid.shape, camera=self._grid.camera)
         shots = max(self._first_shots, self._shots - len(self._lattice_uv))
         acquisition = acquire(
-            sensor, seeds, rounds=self._rounds, selector=self._selector, shots=shots, threads=self._threads
+            sensor, seeds, rounds=self.rounds, selector=self.selector, shots=shots, threads=self.threads
         )
         self._by = acquisition.by
         self._book(sensor, 0, anew=True)
-        return acquisition.reconstruct(self._threads)
+        return acquisition.reconstruct(self.threads)
 
     def _book(self, sensor: _Sensor, first: int, *, anew: bool = False) -> None:
         """Take in this frame's answers from number `first` on, and draw the model."""
@@ -327,7 +322,7 @@ class TemporalAcquisition:
         mm = np.concatenate([np.empty(0, np.float32), *sensor.depth_mm[first:]])
         book(self._memory, uv, mm, self._frame)
         if anew:  # no point is ever taken out of a mesh
-            self._surface = Surface(self.shape, self._threads)
+            self._surface = Surface(self.shape, self.threads)
             uv = pixels_where(self._memory.held)
         self._surface.put(uv, self._memory.fused_mm[uv[:, 1], uv[:, 0]])
         if self._surface.points - np.count_nonzero(self._memory.held) > MOST_LOST:
@@ -338,17 +333,17 @@ class TemporalAcquisition:
         if shots <= 0:
             return
         worth = np.empty(self.shape, np.float32)
-        layers, noise = self._surface.layers, (self._noise.floor_mm, self._noise.per_mm)
+        layers, noise = self._surface.layers, (self.noise.floor_mm, self.noise.per_mm)
         known = self._memory, layers.depth_mm, layers.gap_sq
-        in_bands(shot_worth, len(worth), self._threads, *known, self._reach_sq, noise, self._frame, WRONG, worth)
+        in_bands(shot_worth, len(worth), self.threads, *known, self._reach_sq, noise, self._frame, WRONG, worth)
         first = len(sensor.uv)
-        if self._selector is not None:
-            samples = Samples(self.shape, (self._reach_sq**0.5) / 1.3)
+        if self.selector is not None:
+            samples = Samples(self.shape, self._pitch_px)
             held = self._memory.held > 0
             samples.add(pixels_where(held), self._memory.fused_mm[held])
-            new = plan_of(self._selector, samples, self._threads).best(shots // 2)
+            new = plan_of(self.selector, samples, self.threads).best(shots // 2)
             sensor(sensor.unasked(new))
             worth[self._memory.held == 0] = 0
             shots -= shots // 2
-        sensor(choose(worth, shots, threads=self._threads))
+        sensor(choose(worth, shots, threads=self.threads))
         self._book(sensor, first)
