@@ -103,11 +103,12 @@ class RecordedFolder(DepthSource):
         shape = _shape_of(self._files, sidecar.camera) if self._stack is None else self._stack.shape[1:]
         self.camera, camera_from = self._camera(shape, intrinsics, sidecar.camera, beside)
         self._timestamps_us = sidecar.timestamps_us or self.found.timestamps_us
-        if self._timestamps_us is not None and len(self._timestamps_us) != self.frame_count:
-            raise DamagedRecordingError(
-                f"'{path}' holds {self.frame_count} frames, but {SIDECAR} lists"
-                f" {len(self._timestamps_us)} timestamps; correct the list or remove it."
-            )
+        for name, times in (("", self._timestamps_us), ("colour_", sidecar.colour_timestamps_us)):
+            if times is not None and len(times) != self.frame_count:
+                raise DamagedRecordingError(
+                    f"'{path}' holds {self.frame_count} frames, but {SIDECAR} lists"
+                    f" {len(times)} {name}timestamps; correct the list or remove it."
+                )
         self.fps = sidecar.fps or _fps_from(self._timestamps_us)
         marks = self.found.row.marks if sidecar.missing is None else sidecar.missing
         said = values_per_metre or sidecar.values_per_metre

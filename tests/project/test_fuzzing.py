@@ -36,13 +36,14 @@ FOUND = [
     ("tum", {"depth.txt": b"1e300 depth/0.png\n1.6 depth/1.png\n"}),  # ValueError of the frame's timestamp
     ("settings", {"settings.toml": b"nodes = " + b"[" * 5000}),  # RecursionError
     ("folder", {"0.png": b"\x89PNG\r\n\x1a\n"}),
+    ("folder", {"frames.toml": b"colour_timestamps_us = []\n"}),  # IndexError
 ]
 
 
 @pytest.mark.parametrize(("name", "files"), FOUND)
 def test_what_was_found_once_is_a_named_error(name: str, files: dict[str, bytes], tmp_path: Path) -> None:
     target = TARGETS[name]
-    base = dict(target.make()[0]) if name == "tum" else {}
+    base = dict(target.make()[0]) if name == "tum" or "frames.toml" in files else {}
     assert try_one(target, base | files, tmp_path) not in ("read",)
 
 
