@@ -105,7 +105,7 @@ class Batch:
     ) -> None:
         self.job = job
         self.listed = self.done = self.skipped = self.failures = 0
-        self.complete = False
+        self.complete = self._unfinished = False
         self._words, self._failed = words, failed
         self._made, self._heard = 0, {}  # type: tuple[int, dict[str, int]]
         self._trouble: BaseException | None = None
@@ -153,7 +153,8 @@ class Batch:
         self._flush()
         summary = pa.concat_tables([schema_of(SUMMARY).empty_table(), *self._tables]).sort_by("recording")
         write_table(out / SUMMARY_FILE, summary, SCHEMA)
-        shutil.rmtree(out / WORK, ignore_errors=True)
+        if not self._unfinished:  # whose ranges are kept for the next run
+            shutil.rmtree(out / WORK, ignore_errors=True)
         return summary
 
     def _listing(self) -> Iterator[Recording | None]:
@@ -203,7 +204,8 @@ class Batch:
             if type(result).__name__ == "KilledWorker":
                 sentence = "its worker ended each time it was tried; is there enough memory?"
             result = {"recording": recording.name, "source": recording.source, "state": "failed", "frames": 0}
-            result |= {"failure": sentence, "work_s": 0.0}
+            result |= {"failure": sentence, "work_s": 0.0, "unfinished": True}
+            self._unfinished |= at >= 0
         if cut is not None and at >= 0:
             self._heard[f"{recording.name} {cut[0].starts[at]}"] = result["frames"]
             cut[1][at] = result

@@ -177,7 +177,7 @@ def do_range(job: Job, recording: Recording, cut: Cut, at: int) -> dict[str, Any
 def join(job: Job, recording: Recording, cut: Cut, ranges: list[dict[str, Any]]) -> dict[str, Any]:
     """Make one table of those of the ranges, up to the first damage; returns its row of the summary."""
     path = job.table(recording)
-    about = cut.about
+    about, key = cut.about, cut.key
     with writing(path, job.stated) as table:
         for start, each in zip(cut.starts, ranges, strict=True):
             about |= {name: each[name] for name in ("state", "failure", "colour") if each.get(name) is not None}
@@ -185,9 +185,11 @@ def join(job: Job, recording: Recording, cut: Cut, ranges: list[dict[str, Any]])
                 table.add(row)
             if each["failure"]:
                 about["state"] = "damaged" if table.rows else "failed"
+                key = "" if each.get("unfinished") else key  # to be tried again
                 break
-        row = table.finish(cut.key, about | {"work_s": sum(each["work_s"] for each in ranges)})
-    shutil.rmtree(job.part(recording, 0).parent, ignore_errors=True)
+        row = table.finish(key, about | {"work_s": sum(each["work_s"] for each in ranges)})
+    if key:
+        shutil.rmtree(job.part(recording, 0).parent, ignore_errors=True)
     return row
 
 

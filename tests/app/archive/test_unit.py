@@ -65,6 +65,22 @@ def test_ranges_make_the_table_of_the_whole(name: str, tmp_path: Path, monkeypat
     assert one[f"{name}.parquet"].equals(other[f"{name}.parquet"])
 
 
+def test_range_that_could_not_be_done_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unit, "RANGE_FRAMES", 3)
+    recording, job = Recording("virtual:ball?frames=9&size=64x48", "ball"), job_at(tmp_path)
+    cut = do_recording(job, recording)
+    assert isinstance(cut, Cut)
+    ranges = [do_range(job, recording, cut, at) for at in range(3)]
+    lost = {"frames": 0, "failure": "its worker ended", "work_s": 0.0, "unfinished": True}
+    row = join(job, recording, cut, [ranges[0], lost, ranges[2]])
+    assert (row["state"], row["frames"], row["failure"]) == ("damaged", 3, "its worker ended")
+    assert isinstance(do_recording(job, recording), Cut)
+    assert [do_range(job, recording, cut, at) for at in range(3)] == ranges  # which are there still
+    assert join(job, recording, cut, ranges)["state"] == "whole"
+    done = do_recording(job, recording)
+    assert isinstance(done, dict) and done["done_before"]
+
+
 @pytest.mark.parametrize(
     "changes", [{"gas": GasOptions(nodes=200)}, {"acquire": AcquireOptions(budget=0.05, memory="still")}]
 )
