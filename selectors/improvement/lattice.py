@@ -40,9 +40,7 @@ def lattice_scratch(most_pixels: int) -> tuple[Floats, ...]:
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
-    padded, i, order, batch, geometry, sides, tables, scratch, strip
-):
+def krige_lanes(padded, i, order, batch, geometry, sides, tables, scratch, strip):  # type: ignore[no-untyped-def]
     """Krige the windows of lattice row `i` in batch number `batch`.
 
     Lanes whose window has a hole come out finite, but of no meaning.
@@ -142,9 +140,7 @@ def krige_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _fit_lanes(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
-    padded, i, order, batch, tables, geometry, s
-):
+def _fit_lanes(padded, i, order, batch, tables, geometry, s):  # type: ignore[no-untyped-def]
     """Gather the depths, fit (a, b) and weigh the contrasts of each lane."""
     basis, eigenvalues = tables.basis[geometry], tables.eigenvalues[geometry]
     distance_sums, moments = tables.distance_sums[geometry], tables.moments[geometry]

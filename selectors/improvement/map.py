@@ -51,9 +51,7 @@ def gather_seeds(padded, rows, columns, i, j, samples):  # type: ignore[no-untyp
 
 
 @njit(cache=True, nogil=True)
-def krige_row(  # type: ignore[no-untyped-def]
-    i, padded, lattice, frame_shape, scratch, strip, held
-):
+def krige_row(i, padded, lattice, frame_shape, scratch, strip, held):  # type: ignore[no-untyped-def]
     """Krige all windows of one lattice row.
 
     Parameters

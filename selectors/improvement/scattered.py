@@ -127,9 +127,7 @@ def _spiral(reach: int) -> Longs:
 
 
 @njit(cache=True, forceinline=True, nogil=True)
-def _gather(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
-    measured, spiral, row, column, up, down, left, right, samples
-):
+def _gather(measured, spiral, row, column, up, down, left, right, samples):  # type: ignore[no-untyped-def]
     """Collect the samples of a window's box, the nearest to its centre first."""
     height, width = measured.shape
     u, v, z, row_of = samples
@@ -150,7 +148,7 @@ def _gather(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
 
 
 @njit(cache=True, forceinline=True, nogil=True)
-def _near_sample(measured, spiral, y, x, reach_squared):  # type: ignore[no-untyped-def] # pragma: no cover
+def _near_sample(measured, spiral, y, x, reach_squared):  # type: ignore[no-untyped-def]
     height, width = measured.shape
     for n in range(len(spiral)):
         dv, du = spiral[n]
@@ -162,9 +160,7 @@ def _near_sample(measured, spiral, y, x, reach_squared):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True)
-def _map_rows(  # type: ignore[no-untyped-def] # pragma: no cover - compiled
-    first_row, end_row, measured, asked, lattice, by_sums, scratch, maps
-):
+def _map_rows(first_row, end_row, measured, asked, lattice, by_sums, scratch, maps):  # type: ignore[no-untyped-def]
     """Map the rows first_row..end_row where asked, each window kriged and blended into its cells.
 
     Parameters

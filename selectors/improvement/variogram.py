@@ -43,9 +43,7 @@ def power_table(exponent: float, reach: int) -> Doubles:
 
 
 @njit(cache=True, forceinline=True, nogil=True)
-def fit_moments(
-    s0: float, s1: float, s2: float, t0: float, t1: float
-) -> tuple[float, float]:  # pragma: no cover - compiled
+def fit_moments(s0: float, s1: float, s2: float, t0: float, t1: float) -> tuple[float, float]:
     """Fit (a, b) to the moments of the pairs.
 
     Parameters
@@ -76,7 +74,7 @@ def fit_moments(
 
 
 @njit(cache=True, forceinline=True, nogil=True)
-def fit_samples(z, row_of, count, between):  # type: ignore[no-untyped-def] # pragma: no cover
+def fit_samples(z, row_of, count, between):  # type: ignore[no-untyped-def]
     """Fit (a, b) to all pairs of the first `count` samples.
 
     Parameters
