@@ -405,7 +405,7 @@ def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
     seen = frame()
     acquisition = acquire(seen.measure, SeedGrid.from_frame(seen, SHAPE), 10, 1)
     with pytest.raises(OutputError, match=r"cloud\.ply' cannot be written: No such file"):
-        save_cloud(tmp_path / "missing" / "cloud.ply", acquisition, seen)
+        save_cloud(tmp_path / "missing" / "cloud.ply", acquisition, seen.camera)
     with pytest.raises(OutputError, match="cannot be written"):
         save_depth(tmp_path / "missing" / "depth.png", np.zeros((2, 2)))
     (tmp_path / "file").touch()

@@ -33,7 +33,12 @@ def test_a_run_with_memory_says_shows_and_saves_what_it_knows(
         assert row in told
     assert tomllib.loads(saved.with_suffix(".toml").read_text())["memory"] == "still"
     entities = {str(part.entity_path) for part in RrdReader(str(saved)).stream()}
-    assert {"/camera/memory/age", "/camera/memory/changed", "/figures/known", "/figures/truth_rmse_mm"} <= entities
+    assert {
+        "/camera/memory/age",
+        "/camera/memory/changed",
+        "/figures/known_percent",
+        "/figures/truth_rmse_mm",
+    } <= entities
     samples = np.load(model / "samples.npz")
     assert len(samples["uv"]) == len(read_ply(model / "cloud.ply").points) > 32 * 32
     assert cv2.imread(str(model / "depth.png"), cv2.IMREAD_UNCHANGED).shape == (120, 160)
