@@ -153,7 +153,8 @@ class Session:
             report.troubles += source.notes
             told = len(source.notes)
             pipeline = stack.enter_context(Pipeline(self.settings, realtime=source.live))
-            frames = _frames_in_all(self.settings.run.frames, source.frame_count)
+            limits = self.settings.run.frames, source.frame_count
+            frames = min((limit for limit in limits if limit is not None), default=None)  # None: nobody knows
             viewer = self._open_viewer(pipeline, frames)
             seen = viewer.options
             try:
@@ -270,9 +271,3 @@ def _tell(source: DepthSource) -> None:
         f"{source.uri}: {count} frames, {at.width}x{at.height}, {source.fps:.4g} frames/s, fx {at.fx:.1f}"
         f" fy {at.fy:.1f} cx {at.cx:.1f} cy {at.cy:.1f}; {default_threads()} kernel threads"
     )
-
-
-def _frames_in_all(limit: int | None, count: int | None) -> int | None:
-    """How many frames will come at most; None where nobody knows."""
-    known = [number for number in (limit, count) if number is not None]
-    return min(known, default=None)

@@ -15,6 +15,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -37,7 +38,7 @@ ENDLESS_FRAMES = 120
 
 Results = dict[str, dict[str, dict[str, float]]]
 """Budget -> strategy -> figure, as the JSON file has it."""
-_Arguments = tuple[Sequence[float], int, int, Sequence[str], Settings]
+_Chosen = Iterator[tuple[int, DepthFrame]]
 
 
 @dataclass(frozen=True)
@@ -103,13 +104,12 @@ def run_strategy(name: str, case: Case) -> Errors:
     return Errors(*errors, len(uv) - len(case.seed_uv), float(np.mean(depth_mm == 0)))
 
 
+_Work = Callable[[DepthFrame], list[Outcome]]
+_Keep = Callable[[int, list[Outcome]], None]
+
+
 def _evaluate_frame(
-    frame: DepthFrame,
-    budgets: Sequence[float],
-    rounds: int,
-    random_seeds: int,
-    strategies: Sequence[str],
-    settings: Settings,
+    budgets: Sequence[float], rounds: int, draws: int, strategies: Sequence[str], settings: Settings, frame: DepthFrame
 ) -> list[Outcome]:
     seeds_shape = settings.seeds.rows, settings.seeds.columns
     label = f"{frame.source} {frame.index}"
@@ -118,10 +118,9 @@ def _evaluate_frame(
         shots = shots_of(float(budget), frame.shape)
         measured = (shots + seeds_shape[0] * seeds_shape[1]) / frame.depth_mm.size
         for name in strategies:
-            draws = random_seeds if strategy_of(name).chance else 1
-            errors = tuple(
-                run_strategy(name, Case(frame, seeds_shape, shots, rounds, seed, settings)) for seed in range(draws)
-            )
+            seeds = range(draws if strategy_of(name).chance else 1)
+            cases = (Case(frame, seeds_shape, shots, rounds, seed, settings) for seed in seeds)
+            errors = tuple(run_strategy(name, case) for case in cases)
             outcomes.append(Outcome(label, budget, name, errors, frame.source, frame.index, measured))
     return outcomes
 
@@ -214,7 +213,7 @@ def outcomes(
     wanted = {*strategies_of(strategies), "uniform", "oracle"}
     names = [n for n in STRATEGIES if n in wanted] + sorted(wanted.difference(STRATEGIES))
     jobs = jobs or default_threads()
-    arguments = (budgets, rounds, random_seeds, names, settings or Settings())
+    work: _Work = partial(_evaluate_frame, budgets, rounds, random_seeds, names, settings or Settings())
     total = _most(sources, every, frames)
     found: dict[int, list[Outcome]] = {}
 
@@ -227,12 +226,12 @@ def outcomes(
     if isinstance(jobs, str):
         with engine(jobs) as client:
             workers = max(1, sum(client.nthreads().values()))
-            _through(client.get_executor(pure=False), chosen, arguments, workers, keep)
+            _through(client.get_executor(pure=False), chosen, work, workers, keep)
     elif min(jobs, total) == 1:
         for number, frame in chosen:
-            keep(number, _evaluate_frame(frame, *arguments))
+            keep(number, work(frame))
     else:
-        _spread(chosen, arguments, jobs, keep)
+        _spread(chosen, work, jobs, keep)
     if not found:
         raise SourceNotFoundError(f"no frame with depth in {', '.join(sources)}; give another source or --every 1.")
     progress(len(found), len(found))
@@ -249,12 +248,7 @@ def _most(sources: Sequence[str], every: int, frames: int | None) -> int:
     return total
 
 
-def _spread(
-    chosen: Iterator[tuple[int, DepthFrame]],
-    arguments: _Arguments,
-    jobs: int,
-    keep: Callable[[int, list[Outcome]], None],
-) -> None:
+def _spread(chosen: _Chosen, work: _Work, jobs: int, keep: _Keep) -> None:
     """Evaluate frames in so many processes, with no more of them in memory than keep these busy."""
     # Spawned, not forked: the parent may hold threads and locks of other libraries.
     spawn = multiprocessing.get_context("spawn")
@@ -262,7 +256,7 @@ def _spread(
     pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_worker)
     done = False
     try:
-        _through(pool, chosen, arguments, jobs, keep)
+        _through(pool, chosen, work, jobs, keep)
         done = True
     finally:
         if not done:  # after Ctrl-C, say: what is under way is not waited for
@@ -271,13 +265,7 @@ def _spread(
         pool.shutdown(wait=done, cancel_futures=True)
 
 
-def _through(
-    pool: Executor,
-    chosen: Iterator[tuple[int, DepthFrame]],
-    arguments: _Arguments,
-    jobs: int,
-    keep: Callable[[int, list[Outcome]], None],
-) -> None:
+def _through(pool: Executor, chosen: _Chosen, work: _Work, jobs: int, keep: _Keep) -> None:
     under_way: dict[Future[list[Outcome]], int] = {}
 
     def settle() -> None:
@@ -287,7 +275,7 @@ def _through(
     for number, frame in chosen:
         # A worker whose start is cut short reports that nobody told it what to do.
         with interrupt.deferred(), interrupt.started_deaf():
-            under_way[pool.submit(_evaluate_frame, frame, *arguments)] = number
+            under_way[pool.submit(work, frame)] = number
         if len(under_way) == 2 * jobs:
             settle()
     while under_way:
@@ -324,10 +312,8 @@ def summarise(found: Sequence[Outcome]) -> Results:
                 "worst": max(ratios, default=1.0),
                 "share": float(np.mean(shares)) if shares else 0.0,
                 "share_min": min(shares, default=0.0),
-                "rmse_mm": float(np.mean([e.rmse_mm for e in errors])),
-                "mae_mm": float(np.mean([e.mae_mm for e in errors])),
-                "wrong": float(np.mean([e.wrong for e in errors])),
-                "missed": float(np.mean([e.missed for e in errors])),
             }
+            for figure in ("rmse_mm", "mae_mm", "wrong", "missed"):
+                table[name][figure] = float(np.mean([getattr(error, figure) for error in errors]))
         results[f"{budget:.2f}" if round(budget, 2) == budget else f"{budget:g}"] = table
     return results

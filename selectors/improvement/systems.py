@@ -97,12 +97,9 @@ def window_scratch(pixels: int) -> tuple[npt.NDArray[Any], ...]:
     One per thread. The first three arrays hold the results.
     """
     return (
-        aligned_zeros(pixels),  # estimate
-        aligned_zeros(pixels),  # variance
-        aligned_zeros(pixels),  # improvement
-        aligned_zeros(pixels),  # 1 / estimate, 0 where it does not count
-        aligned_zeros(pixels),  # covariance with the pixel to the right
-        aligned_zeros(pixels),  # covariance with the pixel below
+        # Estimate, variance, improvement; 1 / estimate, 0 where it does not count; the covariances
+        # with the pixel to the right and the one below.
+        *aligned_zeros(6, pixels),
         aligned_empty(MAX_SAMPLES * _STRIDE),  # U
         np.zeros((MAX_SAMPLES, MAX_SAMPLES), np.float64),  # L, its diagonal inverted
         np.zeros(MAX_SAMPLES, np.float64),  # L^-1 (Z - z_ref)
