@@ -134,15 +134,15 @@ def test_snapshots_of_one_name_and_of_strange_names_are_all_written(tmp_path: Pa
     with open_source("virtual:ball?size=320x240&frames=1") as source:
         write_folder(frames, source)
     written = snapshot([str(frames), str(frames)], 0, tmp_path / "out", SMALL, PAGE)
-    assert len(written) == 11
+    assert len(written) == 1 + 2 * 6
     assert set(written) == set((tmp_path / "out").iterdir())
 
 
 def test_snapshot_writes_the_sheet_and_every_panel(tmp_path: Path) -> None:
     sources = ["virtual:ball?size=320x240&frames=2", "virtual:workstation?size=320x240&frames=2"]
     written = snapshot(sources, 1, tmp_path / "new" / "pictures", SMALL, PAGE)
-    assert [path.name for path in written[:3]] == ["sheet.png", "ball-depth.png", "ball-neural-gas.png"]
-    assert len(written) == 11
+    assert [path.name for path in written[:3]] == ["sheet.png", "ball-scene.png", "ball-depth.png"]
+    assert len(written) == 1 + 2 * 6
     sheet = cv2.imread(str(written[0]))
     assert sheet is not None and sheet.shape[1] == 1600
     for path in written[1:]:
