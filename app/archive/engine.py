@@ -27,10 +27,18 @@ PATIENCE_S = 10.0
 """How long a scheduler may take to answer."""
 TOPIC = "selective-depth"
 _QUIET = {
-    # One line each is ours to say; the profiler costs a worker some percent of its time.
+    # One line each is ours to say.
     "logging": {"distributed": "critical", "tornado": "critical", "asyncio": "critical", "bokeh": "critical"},
-    "distributed.worker.profile.enabled": False,
+    # Dask's own has malloc give back what every frame needs again.
+    "distributed.nanny.pre-spawn-environ": {f"{each}_NUM_THREADS": 1 for each in ("OMP", "MKL", "OPENBLAS")},
     "distributed.comm.timeouts.connect": f"{PATIENCE_S:g}s",
+}
+_WORKERS = {
+    "LOGGING__DISTRIBUTED": "critical",  # what matters comes as a result
+    # Looking at itself so often costs a worker some percent of its time.
+    "DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    "DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
+    "DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
 }
 
 
@@ -53,10 +61,10 @@ def engine(scheduler: str | None = None, workers: int | None = None) -> Iterator
     """
     if importlib.util.find_spec("distributed") is None:
         raise AppError("this needs Dask, which is not installed: pip install 'selective-depth[batch]'.")
+    for name, value in _WORKERS.items():  # read when Dask is imported, here and in the workers
+        os.environ.setdefault(f"DASK_{name}", value)
     import dask
 
-    # Of the workers, which read it when they import Dask; what matters of it comes as a result.
-    os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")
     with dask.config.set(_QUIET):
         if scheduler is not None:
             with _there(scheduler) as client:
