@@ -29,14 +29,9 @@ def compiling_beside() -> Iterator[None]:
     started: list[subprocess.Popen[bytes]] = []
 
     def start() -> None:
-        started.append(
-            subprocess.Popen(
-                [sys.executable, "-m", "selective_depth.app.pipeline.warm_up"],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-        )
+        command = [sys.executable, "-m", "selective_depth.app.pipeline.warm_up"]
+        quiet = subprocess.DEVNULL
+        started.append(subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet))
 
     timer = threading.Timer(PATIENCE_S, start)
     timer.daemon = True

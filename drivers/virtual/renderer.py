@@ -158,13 +158,7 @@ def _box(kind, centre, axis, size, lens, shape):  # type: ignore[no-untyped-def]
 def _quad(centre, first, second, size, stuff, lens, nearness, material):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = lens
     height, width = nearness.shape
-    normal = np.array(
-        (
-            first[1] * second[2] - first[2] * second[1],
-            first[2] * second[0] - first[0] * second[2],
-            first[0] * second[1] - first[1] * second[0],
-        )
-    )
+    normal = np.cross(first, second)
     offset = _dot(normal, centre)
     if offset > -1e-6:  # seen from behind, or edge on
         return

@@ -38,8 +38,6 @@ class Axis(NamedTuple):
 
     Parameters
     ----------
-    pixels : int
-        Length of the axis.
     centres : int64 array of shape (n,)
         Lattice points, increasing.
     before, after : int64 array of shape (n,)
@@ -57,7 +55,6 @@ class Axis(NamedTuple):
         What each of the two counts, 0..1; 0 outside the window.
     """
 
-    pixels: int
     centres: Longs
     before: Longs
     after: Longs
@@ -97,7 +94,6 @@ class Axis(NamedTuple):
         # Beyond the outermost centre only its window is there, as far as that reaches.
         covered = (x > at[first] - before[first]) & (x < at[first] + after[first])
         return cls(
-            pixels=pixels,
             centres=at,
             before=before,
             after=after,

@@ -231,20 +231,18 @@ class TemporalAcquisition:
             self._memory = Memory.of(self.shape)
             self._still = 0
             changed[:] = True
-        settled = self._probation < self._still
-        model_mm = None
-        if restarted or not settled:
-            model_mm = self._start(sensor)
-        else:
-            if changed.any():
+        settled = self._probation < self._still  # never after a restart
+        if settled:
+            moved = bool(changed.any())
+            if moved:
                 self._alert = ALERT_FRAMES
                 forget(self._memory, changed)
-            self._book(sensor, 0, anew=bool(changed.any()))
-            rounds = self.rounds if changed.any() else 1
-            for left in range(rounds, 0, -1):
+            self._book(sensor, 0, anew=moved)
+            for left in range(self.rounds if moved else 1, 0, -1):
                 self._measure_best(sensor, (self._shots - sensor.spent) // left)
-        if model_mm is None:
             model_mm = self._surface.layers.depth_mm.copy()
+        else:
+            model_mm = self._start(sensor)
         known = self._memory.held > 0
         return TemporalStep(
             frame=self._frame,
