@@ -8,7 +8,7 @@ from pathlib import Path
 
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import OK
-from selective_depth.app.console.output import IMAGES, check_picture, is_picture, make_folder, write_image
+from selective_depth.app.console.output import IMAGES, PICTURES, check_picture, make_folder, write_image
 from selective_depth.app.console.progress import waiting
 from selective_depth.app.pictures import StillRow, alone, contact_sheet, panels_of, write_picture
 from selective_depth.app.pipeline import FrameResult, Pipeline, open_and_tell, say
@@ -85,7 +85,7 @@ def snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings,
     """
     if not sources:
         raise UsageError("no source was named; give recordings, folders or scenes.")
-    single = is_picture(out)
+    single = out.suffix.lower() in PICTURES
     if single:
         check_picture(out)
     else:

@@ -73,11 +73,6 @@ def check_picture(path: Path | None, endings: Sequence[str] = PICTURES, what: st
     check_output(path)
 
 
-def is_picture(path: Path) -> bool:
-    """Whether a file's ending is that of a picture that can be written."""
-    return path.suffix.lower() in PICTURES
-
-
 def make_folder(path: Path) -> None:
     """Make a folder, and those above it, unless it is there.
 

@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from typing import Any, Self
 
 import numpy as np
@@ -33,15 +32,6 @@ EVEN_EVERY = 10
 MODEL_EVERY = 10
 """Of a sensor's frames, one in so many gets a dense model: at 30 frames/s, one of every frame
 would take most of a core, which the frames themselves need."""
-
-
-@contextmanager
-def _as_options(section: str) -> Iterator[None]:
-    """Name the option where a selector names its parameter: they are called the same."""
-    try:
-        yield
-    except ValueError as error:
-        raise UsageError(f"--{section}.{error}.") from None
 
 
 class _AtOnce(Executor):
@@ -75,8 +65,10 @@ class Pipeline:
 
     Raises
     ------
+    ValueError
+        If an option of a selector is out of its range, which the command line refuses before.
     UsageError
-        If an option of a selector is out of its range.
+        If there is no such selector, or nothing for a memory to spend.
     """
 
     def __init__(self, settings: Settings, *, realtime: bool = False, one_thread: bool = False) -> None:
@@ -85,10 +77,8 @@ class Pipeline:
         self.times = StageTimes()
         self._settings = settings
         self._live_gas = settings.gas.training == "live"
-        with _as_options("gas"):
-            self._gas = gas_of(settings, self._threads)
-        with _as_options("improvement"):
-            self._improvement = improvement_of(settings, self._threads)
+        self._gas = gas_of(settings, self._threads)
+        self._improvement = improvement_of(settings, self._threads)
         self._selector = selector_of(settings, self._threads)
         self._remembers = settings.acquire.memory == "still"
         if self._remembers and not settings.acquire.budget:
