@@ -40,12 +40,8 @@ def quadtree(measure: Measure, seeds: SeedGrid, shots: int) -> npt.NDArray[np.in
         Pixels measured, column first, the seeds first.
     """
     rows, columns = seeds.rows.tolist(), seeds.columns.tolist()
-    known = {
-        (u, v): float(z)
-        for v, line in zip(rows, seeds.depth_mm, strict=True)
-        for u, z in zip(columns, line, strict=True)
-    }
-    order = list(known)
+    order = [(u, v) for v in rows for u in columns]
+    known = dict(zip(order, seeds.depth_mm.ravel().tolist(), strict=True))
     heap: list[tuple[float, _Cell]] = []
 
     def corners(cell: _Cell) -> list[float]:
@@ -67,8 +63,8 @@ def quadtree(measure: Measure, seeds: SeedGrid, shots: int) -> npt.NDArray[np.in
         _, (u0, v0, u1, v1) = heapq.heappop(heap)
         middle_u, middle_v = (u0 + u1) // 2, (v0 + v1) // 2
         expected = {
-            (u, v): float(np.mean(corners(rim) or [0.0]))
-            for (u, v), rim in {
+            pixel: float(np.mean(corners(rim) or [0.0]))
+            for pixel, rim in {
                 (middle_u, middle_v): (u0, v0, u1, v1),
                 (middle_u, v0): (u0, v0, u1, v0),
                 (middle_u, v1): (u0, v1, u1, v1),
