@@ -47,8 +47,6 @@ def check(sources: Sequence[str], *, repair: Path | None, timeout_s: float) -> i
     int
         Exit code: 0 if nothing is wrong (or a repaired file was written), else 1.
     """
-    if not timeout_s > 0:
-        raise UsageError(f"--timeout is {timeout_s:g}; it must be more than 0.")
     found = list(recordings(sources))
     if len(found) == len(sources) == 1 and not Path(found[0].source).is_dir():
         return check_file(Path(parted(sources[0])[0]), repair=repair, timeout_s=timeout_s)
