@@ -1,8 +1,4 @@
-"""Make everything in `recordings/` again: `make recordings`.
-
-The `.oni` goes through the real OpenNI2 recorder, fed by the virtual sensor of the tests; so
-this needs the OpenNI2 runtime, its headers and a C++ compiler (`make system-packages`).
-"""
+"""Make everything in `recordings/` again: `make recordings`."""
 
 from __future__ import annotations
 
@@ -11,28 +7,32 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from virtual_sensor import record_oni
 
 from selective_depth.drivers.folder import write_folder
+from selective_depth.drivers.oni import write_oni
 from selective_depth.drivers.open import open_source
 
 RECORDINGS = Path(__file__).parent.parent / "recordings"
 ORIGINAL = "virtual:workstation?frames=30&speed=2&seed=7"
-OTHERS = {"ball": "virtual:ball?frames=8&speed=2&seed=7", "firehose": "virtual:firehose?frames=8&speed=2&seed=7"}
+OTHERS = {
+    "ball": "virtual:ball?frames=8&speed=2&seed=7&colour=off",
+    "firehose": "virtual:firehose?frames=8&speed=2&seed=7&colour=off",
+}
 LIMIT_MB = 12
 
 
 def main() -> None:
     for name in OTHERS:
         shutil.rmtree(RECORDINGS / name, ignore_errors=True)
-    with open_source(ORIGINAL) as source:
-        originals = np.stack([frame.depth_mm for frame in source])
     recording = RECORDINGS / "workstation.oni"
-    record_oni(originals, recording)
+    recording.unlink(missing_ok=True)
+    with open_source(ORIGINAL) as source:
+        originals = list(source)
+    write_oni(recording, originals, fps=30)
     with open_source(recording) as source:
-        frames = list(source)
-    if not np.array_equal(originals, [frame.depth_mm for frame in frames]):
-        sys.exit(f"{recording} does not hold the frames that were recorded")
+        for original, frame in zip(originals, source, strict=True):
+            if not np.array_equal(original.depth_mm, frame.depth_mm) or frame.colour is None:
+                sys.exit(f"{recording} does not hold the frames that were recorded")
     for name, uri in OTHERS.items():
         with open_source(uri) as source:
             write_folder(RECORDINGS / name, source, compression=9)
