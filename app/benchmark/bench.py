@@ -34,6 +34,8 @@ WARM_UP = 10
 Say = Callable[[str], None]
 Durations = dict[str, list[float]]
 """Milliseconds of every run of a stage, by the stage's name."""
+SCHEMA = 1
+"""Version of the JSON's keys."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class BenchReport:
 
     def to_json(self) -> str:
         """The report as JSON: milliseconds per stage, seconds per peer."""
-        content = asdict(self) | {"ratios": ratios(self)}
+        content = {"schema": SCHEMA} | asdict(self) | {"ratios": ratios(self)}
         for summary in content["stages"].values():
             del summary["count"]
         return json.dumps(content, indent=2) + "\n"

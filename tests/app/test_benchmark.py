@@ -29,6 +29,7 @@ def test_figures_have_the_documented_shape(small: None, tmp_path: Path) -> None:
     written, page = tmp_path / "out.json", tmp_path / "page.md"
     bench_report.run_bench(SOURCE, 3, json=written, page=page, peers=True)
     report = json.loads(written.read_text())
+    assert report["schema"] == 1
     assert set(report["stages"]) >= {
         "improvement",
         "improvement_one_thread",
