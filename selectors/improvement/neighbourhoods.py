@@ -177,7 +177,7 @@ class Windows:
 
     @property
     def most_pixels(self) -> int:
-        """Room for the pixels of the largest window, `kriging.padded_pixels`."""
+        """Room for the pixels of the largest window, `padded_pixels`."""
         height = int((self.rows.before + self.rows.after).max()) - 1
         width = int((self.columns.before + self.columns.after).max()) - 1
         return padded_pixels(width, height)

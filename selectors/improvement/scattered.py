@@ -1,7 +1,7 @@
 """The improvement map of samples anywhere, and only where it is asked for.
 
 After a round of acquisition the samples are no lattice any more. The windows stay as they are
-(see `windows`): each now holds all the samples in its box, the nearest to its centre first. On
+(see `neighbourhoods`): each now holds all the samples in its box, the nearest to its centre first. On
 a lattice alone that is the same system as `ImprovementSelector` solves.
 """
 

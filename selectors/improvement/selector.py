@@ -2,7 +2,7 @@
 
 Seeds in, an `ImprovementSelection` out: for every pixel how much the variance-to-mean ratio of
 its neighbourhood falls if it were measured (eq. 13, 23), and beside it the kriging estimate and
-its variance. See `kriging` for the system, `windows` for how the systems are laid over a frame
+its variance. See `systems` for the system, `neighbourhoods` for how the systems are laid over a frame
 and `app/docs/improvement.md` for every choice that the paper leaves open.
 """
 
