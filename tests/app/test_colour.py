@@ -31,7 +31,7 @@ def saved(path: Path, source: str) -> dict[str, list[object]]:
     found: dict[str, list[object]] = {}
     for chunk in RrdReader(str(path)).stream():
         batch = chunk.to_record_batch()
-        for name in batch.schema.names:
+        for name in (each for each in batch.schema.names if ":" in each):  # components, not times
             found.setdefault(f"{chunk.entity_path} {name}", []).extend(batch.column(name).to_pylist())
     return found
 
