@@ -98,7 +98,7 @@ std::vector<OniVideoMode> offered_modes() {
 
 class DepthStream : public oni::driver::StreamBase {
 public:
-    DepthStream() : mode_(offered_modes().front()), mirror_(TRUE) {}
+    explicit DepthStream(std::atomic<long>& count) : count_(count), mode_(offered_modes().front()), mirror_(TRUE) {}
     ~DepthStream() override { stop(); }
 
     OniStatus start() override {
@@ -229,6 +229,7 @@ private:
         }
         frame->sensorType = ONI_SENSOR_DEPTH;
         frame->frameIndex = int(++made_);
+        count_ = made_;
         const uint64_t time_us = uint64_t(made_) * 1000000 / 30;
         switch (control().number("clock", 0)) {
         case 1: frame->timestamp = 0; break;
@@ -251,6 +252,7 @@ private:
         getServices().releaseFrame(frame);
     }
 
+    std::atomic<long>& count_;
     OniVideoMode mode_;
     std::atomic<int> mirror_;
     std::atomic<bool> running_{false};
@@ -266,10 +268,10 @@ std::vector<OniVideoMode> colour_modes() {
     return {{format, width / 2, height / 2, 30}, {format, width, height, 30}};
 }
 
-// Colour beside depth: its file of raw images goes round in step with that of depth.
+// Colour beside depth: its images are made in step with those of depth, on the same clock.
 class ColourStream : public oni::driver::StreamBase {
 public:
-    ColourStream() : mode_(colour_modes().front()) {}
+    explicit ColourStream(std::atomic<long>& count) : count_(count), mode_(colour_modes().front()) {}
     ~ColourStream() override { stop(); }
 
     OniStatus start() override {
@@ -329,21 +331,14 @@ public:
 
 private:
     void run() {
-        auto due = Clock::now() + Milliseconds(control().number("colour_first_ms", 50));
+        const auto first = Clock::now() + Milliseconds(control().number("colour_first_ms", 50));
         while (running_) {
-            const auto left = due - Clock::now();
-            if (left > Clock::duration::zero()) {
-                std::this_thread::sleep_for(std::min<Clock::duration>(left, Milliseconds(5)));
+            if (count_ == made_ || Clock::now() < first) {
+                std::this_thread::sleep_for(Milliseconds(1));
                 continue;
             }
-            due = std::max(due + std::chrono::microseconds(1000000 / control().number("fps", 30)),
-                           Clock::now() - Milliseconds(100));
-            const long limit = control().number("limit", -1);
-            if (!control().on("connected") || control().on("stall") || (limit >= 0 && made_ >= limit)) continue;
-            if (control().on("stall_colour"))
-                ++made_; // its clock goes on
-            else
-                deliver();
+            made_ = count_;
+            if (!control().on("stall_colour")) deliver();
         }
     }
 
@@ -351,10 +346,10 @@ private:
         OniFrame* frame = getServices().acquireFrame();
         if (!frame) return;
         const size_t size = row_bytes() * mode_.resolutionY, count = frames_.size() / size;
-        if (count) std::memcpy(frame->data, frames_.data() + (made_ % count) * size, size);
+        if (count) std::memcpy(frame->data, frames_.data() + ((made_ - 1) % count) * size, size);
         const int rows = mode_.resolutionY / (control().on("odd_colour") ? 2 : 1);
         frame->sensorType = ONI_SENSOR_COLOR;
-        frame->frameIndex = int(++made_);
+        frame->frameIndex = int(made_);
         frame->timestamp = uint64_t(made_) * 1000000 / 30 + control().number("colour_late_us", 0);
         frame->videoMode = mode_;
         frame->width = mode_.resolutionX;
@@ -367,6 +362,7 @@ private:
         getServices().releaseFrame(frame);
     }
 
+    std::atomic<long>& count_;
     OniVideoMode mode_;
     std::atomic<bool> running_{false};
     std::thread thread_;
@@ -410,9 +406,9 @@ public:
     }
 
     oni::driver::StreamBase* createStream(OniSensorType type) override {
-        if (type == ONI_SENSOR_COLOR && !control().on("refuse_colour")) return new ColourStream();
+        if (type == ONI_SENSOR_COLOR && !control().on("refuse_colour")) return new ColourStream(count_);
         if (type != ONI_SENSOR_DEPTH || control().on("refuse_stream")) return nullptr;
-        return new DepthStream();
+        return new DepthStream(count_);
     }
     void destroyStream(oni::driver::StreamBase* stream) override { delete stream; }
 
@@ -425,6 +421,7 @@ private:
     std::vector<OniVideoMode> colour_modes_;
     OniSensorInfo info_[2] = {};
     int registration_ = ONI_IMAGE_REGISTRATION_OFF;
+    std::atomic<long> count_{0}; // depth frames made
 };
 
 class VirtualDriver : public oni::driver::DriverBase {
