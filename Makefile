@@ -82,7 +82,7 @@ pictures: $(VENV)/.installed ## Make the pictures of the README and the document
 	@.ci/system-packages libopenni2-0 $(WINDOW_PACKAGES)
 	@$(BIN)/selective-depth replay --headless --save out/viewer.rrd --budget 0.05 --rounds 4
 	@$(BIN)/selective-depth screenshot out/viewer.rrd app/docs/pictures/viewer.webp
-	@$(BIN)/selective-depth snapshot virtual:workstation virtual:ball virtual:firehose --out out/stills
+	@$(BIN)/selective-depth snapshot virtual:workstation virtual:ball virtual:firehose --frame 5 --budget 5% --rounds 8 --out app/docs/pictures/sheet.webp
 	@$(BIN)/selective-depth evaluate "virtual:workstation?seed=7" --frames 1 --budget 0.05 --picture app/docs/pictures/evaluation.webp
 	@$(BIN)/python tests/make_virtual_docs.py
 
