@@ -38,7 +38,7 @@ def sound(oni_sample: OniSample) -> bytes:
 
 
 def test_short(sound: bytes, tmp_path: Path) -> None:
-    _fuzz(sound, tmp_path, mutated=30, cut=8, seed=1)
+    _fuzz(sound, tmp_path, mutated=20, cut=6, seed=1)
 
 
 def test_repaired_files_replay_through_openni2(sound: bytes, tmp_path: Path) -> None:

@@ -154,7 +154,7 @@ def sleep_through(tmp_path: Path, seconds: float) -> None:
 
 
 def test_a_run_that_was_stopped_goes_on(virtual_sensor: VirtualSensor, tmp_path: Path) -> None:
-    sleep_through(tmp_path, 4)
+    sleep_through(tmp_path, 2)
 
 
 @pytest.mark.slow
@@ -162,6 +162,7 @@ def test_a_laptop_that_was_closed_for_twenty_seconds(virtual_sensor: VirtualSens
     sleep_through(tmp_path, 20)
 
 
+@pytest.mark.slow
 def test_a_wall_clock_that_jumps_a_day_changes_nothing(virtual_sensor: VirtualSensor, tmp_path: Path) -> None:
     libraries = sorted(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"))
     if not libraries:
