@@ -95,7 +95,7 @@ def fill(machine: Machine, name: str, folder: Path, times: int) -> None:
             assert set(left) == set(before), limit
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", ["export folder", "export oni", "repair", "model", "evaluate json"])
 def test_a_command_that_writes_leaves_all_or_nothing(name: str, machine: Machine, tmp_path: Path) -> None:
     fill(machine, name, tmp_path, 1)
 

@@ -104,7 +104,7 @@ def desk_mm() -> npt.NDArray[np.uint16]:
         return np.stack([frame.depth_mm for frame in source])
 
 
-LENGTHS = [100, pytest.param(FRAMES, marks=pytest.mark.slow)]
+LENGTHS = [60, pytest.param(FRAMES, marks=pytest.mark.slow)]
 
 
 @pytest.mark.openni

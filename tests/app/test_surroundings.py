@@ -56,6 +56,7 @@ def in_kernel(client: object, code: str, timeout_s: float = 120) -> str:
     return "".join(said) if status == "ok" else f"{status}: {reply['content'].get('ename')}"
 
 
+@pytest.mark.slow
 @pytest.mark.openni
 def test_in_a_jupyter_kernel(virtual_sensor: VirtualSensor, tmp_path: Path) -> None:
     manager = KernelManager()

@@ -84,6 +84,7 @@ def test_figures_are_those_of_replay(archive: Archive, undisturbed: tuple[Path, 
         assert last[figure] == value or (last[figure] is None and value != value), figure
 
 
+@pytest.mark.slow
 def test_again_nothing_is_done(archive: Archive, undisturbed: tuple[Path, Done]) -> None:
     out, _ = undisturbed
     before, times = tables(out), {path: path.stat().st_mtime_ns for path in out.rglob("lab/**/*.parquet")}
@@ -117,6 +118,7 @@ def _killed_at_times(archive: Archive, expected: Path, out: Path, counts: list[i
     assert not list(out.rglob(".*"))
 
 
+@pytest.mark.slow
 def test_killed_worker(archive: Archive, undisturbed: tuple[Path, Done], tmp_path: Path) -> None:
     process = start(archive.path, "--out", tmp_path, *QUICK)
     wait_for(lambda: made(tmp_path) > 10)
@@ -221,6 +223,7 @@ def test_scheduler_that_is_not_there(
     assert "no scheduler answers at 'tcp://127.0.0.1:9'" in capsys.readouterr().err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_list_on_stdin_and_what_is_kept(tmp_path: Path) -> None:
     write(tmp_path / "a b.oni", "ball", 4, 1)
     scene = "virtual:ball?frames=3&size=64x48"
