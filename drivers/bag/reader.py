@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.drivers.bag.library import readable, rosbags
+from selective_depth.drivers.bag.optional import readable, rosbags
 from selective_depth.drivers.colour import CONVERSIONS, ON, Colouring, nearest, rgb_of, rgb_of_file
 from selective_depth.drivers.errors import SourceEndedError, SourceError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthFrame, millimetres

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from selective_depth.drivers.bag.library import rosbags
+from selective_depth.drivers.bag.optional import rosbags
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.frame import Camera, DepthFrame
 
