@@ -278,7 +278,7 @@ def _inside_zip(data: bytes, draw: random.Random) -> bytes:
                 inner = bytearray(archive.read(name))
                 draw.choice(_WAYS)(inner, draw)
                 out.writestr(name, bytes(inner))
-    except (zipfile.BadZipFile, zlib.error, ValueError, NotImplementedError, EOFError, OSError):
+    except (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, OSError):
         return data  # damaged from without already
     return packed.getvalue()
 
