@@ -39,7 +39,7 @@ def recordings(words: Iterable[str], out: Path | None = None) -> Iterator[Record
     """All recordings that some words name, one by one: files, folders, patterns, ``-`` for a list on stdin.
 
     The name of a recording is its path from the folder that was given, that folder's name
-    included. Where two sources have one name, the second gets a number that is always the same.
+    included. Where two sources have one name, the second has eight letters more, always the same.
 
     Raises
     ------

@@ -13,18 +13,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from rich.console import Console
-from rich.table import Table
+from rich.markup import escape
 
 from selective_depth.app.archive import Batch, Job, engine
 from selective_depth.app.archive.batch import SUMMARY_FILE
 from selective_depth.app.archive.engine import Stream, dashboard
 from selective_depth.app.commands.model import save_depth, save_result
+from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, OK
 from selective_depth.app.console.output import make_folder, write_image
 from selective_depth.app.console.progress import FrameProgress
 from selective_depth.app.pictures import StillRow, contact_sheet, write_picture
-from selective_depth.app.pictures.palette import FIGURES
 from selective_depth.app.pipeline import FrameResult, StageTimes, figures_of, say
 from selective_depth.app.pipeline.selecting import selector_of
 from selective_depth.app.settings import BatchOptions, Settings, ViewerOptions
@@ -85,12 +85,15 @@ class Keeping:
                 row = StillRow(title, result.frame, result.regions, result.improvement, result.acquisition)
                 write_picture(folder / "stills" / name, contact_sheet([row]))
             if viewer is not None:
-                result.figures.update({k: v for k, v in figures_of(result).items() if k in FIGURES})
+                result.figures.update(figures_of(result))
                 viewer.show(result)
 
-        yield keep
+        try:
+            yield keep
+        finally:
+            if viewer is not None:
+                viewer.close()
         if viewer is not None:
-            viewer.close()
             part.replace(recording)
         if last is not None and self.models:
             save_result(folder / "model", last)
@@ -167,16 +170,11 @@ def _note(batch: Batch, stream: Stream, began_s: float) -> tuple[int, str]:
 
 def _print(summary: pa.Table, batch: Batch, seconds: float, out: Path) -> None:
     """The summary on the terminal: recordings as far as there is room for them, all failures, the whole."""
-    console = Console(highlight=False)
-    table = Table(box=None, pad_edge=False)
-    table.add_column("recording")
-    for name in SHOWN:
-        table.add_column(name, justify="right")
-    table.add_column("")
+    console, rows = Console(highlight=False), []
     for row in summary.slice(0, MOST_ROWS).to_pylist():
         figures = ["" if row[name] is None else f"{row[name]:,.{0 if name in SHOWN[:2] else 1}f}" for name in SHOWN]
-        table.add_row(row["recording"], *figures, "" if row["state"] == "whole" else row["state"])
-    console.print(table)
+        rows.append((escape(row["recording"]), *figures, "" if row["state"] == "whole" else row["state"]))
+    print_table(rows, ("recording", *SHOWN, ""), justify="l" + "r" * len(SHOWN) + "l")
     if len(summary) > MOST_ROWS:
         console.print(f"and {len(summary) - MOST_ROWS:,} more")
     console.print()

@@ -18,7 +18,6 @@ from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pictures import contact_sheet, write_picture
-from selective_depth.app.pictures.palette import FIGURES
 from selective_depth.app.pipeline import (
     Feed,
     FrameResult,
@@ -245,10 +244,10 @@ class Session:
         now_s = time.monotonic()
         self._recent_s.append(now_s)
         result.figures.update(
+            figures_of(result),
             fps=(len(self._recent_s) - 1) / (now_s - self._recent_s[0]),
             dropped_sensor=source.dropped,
             dropped_viewer=sum(viewer.dropped.values()),
-            **{name: value for name, value in figures_of(result).items() if name in FIGURES},
         )
         result.stages_ms.update(pipeline.times.last_ms() | result.stages_ms)
         self.report.take(result)

@@ -14,7 +14,6 @@ from selective_depth.app import __version__
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.output import write_output
 from selective_depth.app.console.settings_file import to_toml
-from selective_depth.app.pipeline.figures import figures_of
 from selective_depth.app.pipeline.result import FrameResult
 from selective_depth.app.pipeline.timing import StageSummary
 from selective_depth.app.settings import Settings
@@ -94,9 +93,9 @@ class RunReport:
         return f"{spent} · even lattice {even_mm:.1f} mm · {even_mm / max(rmse_mm, 1e-9):.1f} times as good"
 
     def take(self, result: FrameResult) -> None:
-        """Add a frame's result."""
+        """Add a frame's result, with its figures."""
         self.frames += 1
-        for name, value in figures_of(result).items():
+        for name, value in result.figures.items():
             self.means[name].add(value)
         if result.acquisition is not None:
             self.by = result.acquisition.by

@@ -94,8 +94,8 @@ class FrameResult:
         Duration of each stage in milliseconds: this frame's own, but for `log`, and for `model`
         where frames do not wait; those are the latest.
     figures : dict of str to float
-        Running figures by name, those of the palette's `FIGURES`; a run adds its rate and its
-        drops before it hands the result on.
+        Running figures by name: a run adds those of `figures_of`, its rate and its drops before it
+        hands the result on.
 
     Attributes
     ----------

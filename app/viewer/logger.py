@@ -16,6 +16,7 @@ from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.blueprint import blueprint, epoch_blueprint
 from selective_depth.drivers.colour import jpeg_of
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.selectors.arrays import pixels_where
 from selective_depth.selectors.memory import TemporalStep
 from selective_depth.selectors.neural_gas import RegionSelection
 
@@ -168,8 +169,7 @@ class StepLogger:
         image = rr.EncodedImage(contents=jpeg_of(frame.colour, JPEG_QUALITY), media_type="image/jpeg")
         self._stream.log("colour", image)
         if frame.registered:
-            rows, columns = np.nonzero(frame.depth_mm[::CLOUD_STEP, ::CLOUD_STEP])
-            uv = np.stack((columns, rows), axis=-1) * CLOUD_STEP
+            uv = pixels_where(frame.depth_mm[::CLOUD_STEP, ::CLOUD_STEP]) * CLOUD_STEP
             points_m = frame.camera.points_mm(uv, frame.measure(uv)) * np.float32(0.001)
             packed = frame.colour[uv[:, 1], uv[:, 0]] @ np.array((1 << 24, 1 << 16, 1 << 8), np.uint32) | np.uint32(255)
             self._stream.log("world/cloud", rr.Points3D(points_m, colors=packed, radii=-1.8))
@@ -229,8 +229,8 @@ class StepLogger:
     def _log_figures(self, step: FrameResult) -> None:
         log = self._stream.log
         log("figures/stages", rr.Scalars([step.stages_ms.get(name, np.nan) for name in STAGES]))
-        for name, value in step.figures.items():
-            if np.isfinite(value):
+        for name in legend.FIGURES:
+            if np.isfinite(value := step.figures.get(name, np.nan)):
                 log(f"figures/{name}", rr.Scalars(value))
 
     def _depth_image(self, depth_mm: npt.NDArray[np.uint16]) -> rr.DepthImage:

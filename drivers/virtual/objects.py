@@ -11,7 +11,7 @@ import numpy.typing as npt
 from selective_depth.drivers.errors import SourceEndedError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
 from selective_depth.drivers.kernels import njit
-from selective_depth.drivers.options import Options
+from selective_depth.drivers.options import Options, parted
 from selective_depth.drivers.source import DepthSource
 from selective_depth.drivers.virtual.ply import Mesh, read_ply
 
@@ -66,7 +66,7 @@ class MeshSource(DepthSource):
     """
 
     def __init__(self, uri: str) -> None:
-        name, _, text = (uri, "", "") if Path(uri).exists() else uri.partition("?")
+        name, text = parted(uri)
         options = Options(text, f"'{name}'")
         side = options.choice("side", "front", tuple(SIDES))
         width, height = options.size("size", (640, 480))
