@@ -124,10 +124,12 @@ class Options:
             raise self._refuse(name, value, words)
         return word, int(number)
 
-    def numbers(self, name: str, what: str, low: float, high: float, between: str = ",") -> tuple[float, ...] | None:
-        """Numbers from `low` to `high`, as many as `what` names; None if absent."""
+    def numbers(
+        self, name: str, what: str, low: float, high: float, between: str = ",", *, words: str = ""
+    ) -> tuple[float, ...] | None:
+        """Numbers from `low` to `high`, as many as `what` names; None if absent. `words` may be given as well."""
         count = len(re.split(between, what))
-        allowed = f"{what}, {'each ' * (count > 1)}a number from {low:g} to {high:g}"
+        allowed = f"{words}{what}, {'each ' * (count > 1)}a number from {low:g} to {high:g}"
         value = self._take(name, allowed)
         if value is None:
             return None
@@ -145,7 +147,7 @@ class Options:
         """One of the words, the first by default, or numbers as `numbers` takes them."""
         if self._given.get(name, words[0]) in words:
             return self.choice(name, words[0], words)
-        return self.numbers(name, what, low, high) or ""
+        return self.numbers(name, what, low, high, words=f"{', '.join(words)}, or ") or ""
 
     def text(self, name: str, what: str) -> str:
         """Any text; empty if absent."""

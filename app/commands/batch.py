@@ -181,9 +181,8 @@ def _print(summary: pa.Table, batch: Batch, seconds: float, out: Path) -> None:
     for row in summary.filter(pc.is_valid(summary["failure"])).to_pylist():
         console.print(f"{row['recording']}: {row['failure']}", soft_wrap=True, markup=False)
     before = f", {batch.skipped:,} of them done before" if batch.skipped else ""
-    console.print(
-        f"{batch.done:,} recordings ({batch.failures:,} not whole{before}), {pc.sum(summary['frames']).as_py() or 0:,}"
-        f" frames; {batch.frames:,} frames in {seconds:.1f} s, {batch.frames / max(seconds, 1e-9):.1f} frames/s",
-        soft_wrap=True,
-    )
+    done = f"{batch.done:,} recording{'s' * (batch.done != 1)} ({batch.failures:,} not whole{before})"
+    there = pc.sum(summary["frames"]).as_py() or 0
+    pace = f"{batch.frames:,} frames in {seconds:.1f} s, {batch.frames / max(seconds, 1e-9):.1f} frames/s"
+    console.print(f"{done}, {there:,} frames; {pace}", soft_wrap=True)
     say(f"wrote {out / SUMMARY_FILE}")

@@ -69,7 +69,7 @@ def _several(doing: str, found: Sequence[Recording], do: Callable[[Recording], t
             rows.append((escape(each.name), f"{frames:,}", escape(trouble or "whole")))
             progress.update(at, f"of the recording{'s' * (len(found) > 1)}")
     print_table(rows, ("recording", "frames", ""), justify="lrl")
-    say(f"{len(found):,} recordings, {wrong:,} not whole")
+    say(f"{len(found):,} recording{'s' * (len(found) != 1)}, {wrong:,} not whole")
     return FAILED if wrong else OK
 
 

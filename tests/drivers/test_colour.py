@@ -116,7 +116,7 @@ def rng() -> np.random.Generator:
 
 @pytest.mark.parametrize("given", ["perhaps", "1,2,3", "1,2,3,4,5,6,7,8", "525,x,1,1,1,1,1"])
 def test_what_is_said_of_colour_is_checked(given: str) -> None:
-    with pytest.raises(SourceNotFoundError, match="colour"):
+    with pytest.raises(SourceNotFoundError, match="give on, off, registered, unregistered, or fx,fy,cx,cy,x,y,z"):
         Colouring.of(Options(f"colour={given}", "it"))
 
 
