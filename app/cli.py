@@ -18,6 +18,7 @@ from selective_depth.app.settings import (
     BatchOptions,
     Flag,
     Limit,
+    LiveSettings,
     Natural,
     PictureOptions,
     Positive,
@@ -39,10 +40,11 @@ EXAMPLES = (
 )
 
 Options = Annotated[Settings, arg(name="")]
+LiveOptions = Annotated[LiveSettings, arg(name="")]
 Acquiring = Annotated[AcquireOptions, arg(name="")]
 Page = Annotated[PictureOptions, arg(name="")]
 Selectors = Annotated[SelectorOptions, arg(name="")]
-DEFAULTS, SELECTORS, PAGE, BATCH = Settings(), SelectorOptions(), PictureOptions(), BatchOptions()
+DEFAULTS, LIVE, SELECTORS, PAGE, BATCH = Settings(), LiveSettings(), SelectorOptions(), PictureOptions(), BatchOptions()
 MODEL = AcquireOptions(budget=0.05, rounds=8)
 SCENES = ("virtual:workstation", "virtual:ball", "virtual:firehose")
 
@@ -77,7 +79,7 @@ def replay(source: SourceOrSample = None, /, settings: Options = DEFAULTS) -> in
     (f"{PROGRAM} live --headless --save demo.rrd --frames 300", "ten seconds, to a file"),
     (f"{PROGRAM} live --serve --serve-address 0.0.0.0:9876", "for viewers on other machines"),
 )
-def live(device: Annotated[str, optional("DEVICE")] = "", /, settings: Options = DEFAULTS) -> int:
+def live(device: Annotated[str, optional("DEVICE")] = "", /, settings: LiveOptions = LIVE) -> int:
     """Watch a sensor through both selectors; end with Ctrl-C.
 
     Parameters

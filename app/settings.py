@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import arg
+from tyro.conf import Fixed, Suppress, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 Source = Annotated[str, arg(metavar="SOURCE")]
@@ -51,7 +51,7 @@ def must_be(allowed: str, kind: Callable[[str], Any], good: Callable[[Any], obje
 
     return PrimitiveConstructorSpec(
         nargs="*" if several else 1,
-        metavar="N" if kind is int else kind.__name__.upper(),
+        metavar="N" if kind is int else kind.__name__.strip("_").upper(),
         instance_from_str=lambda words: tuple(map(value_of, words)) if several else value_of(words[0]),
         is_instance=lambda value: True,
         str_from_instance=lambda value: [*map(str, value)] if several else [str(value)],
@@ -87,6 +87,10 @@ Millimetres = Annotated[int | None, whole(0, 65535), optional("MM")]
 
 
 SourceOrSample = Annotated[str | None, optional("SOURCE")]
+Hide = Annotated[
+    tuple[Literal["colour", "cloud", "nodes", "triangles", "samples"], ...],
+    arg(metavar="colour|cloud|nodes|triangles|samples..."),
+]
 
 
 @dataclass(frozen=True)
@@ -154,6 +158,9 @@ class AcquireOptions:
     by: Annotated[str, arg(metavar="NAME")] = "auto"
     """What drives the shots: auto (the best there is), surface, step, improvement, neural-gas,
     neural-gas-edges, even, or FILE.py:NAME, a selector of your own."""
+    even_every: Annotated[int | None, whole(0), optional("N")] = None
+    """Spend the same evenly as well in every N-th frame, to see what selecting gains; 0 in none.
+    By default in every 3rd of a sensor's and every 10th of a recording's."""
 
 
 @dataclass(frozen=True)
@@ -161,11 +168,27 @@ class RunOptions:
     """How long and how fast."""
 
     frames: Limit = None
-    """Stop after this many frames; by default at the end of the recording, or with Ctrl-C."""
+    """Stop after this many frames; by default at the source's end, or with Ctrl-C."""
     threads: Limit = None
     """Threads of each stage; by default one, or one per processor where frames do not overlap."""
+    no_governor: Flag = False
+    """Leave nothing out where the machine is too slow to keep up with a sensor."""
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """How a recording is played."""
+
+    start: Natural = 0
+    """The first frame to play, from 0."""
+    every: Count = 1
+    """Play every N-th frame."""
+    loop: Flag = False
+    """Begin again at the end, until Ctrl-C."""
     realtime: Flag = False
-    """Replay at the recorded rate, the newest frame first, as a sensor would deliver."""
+    """Play at the recorded rate, the newest frame first, as a sensor would deliver."""
+    speed: Annotated[float | None, positive, optional("FACTOR")] = None
+    """The same, so many times as fast as it was recorded: 0.5 is slow motion."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +199,14 @@ class ViewerOptions:
     """Open no viewer window."""
     save: Annotated[Path | None, optional("FILE.rrd")] = None
     """Write everything to a Rerun recording, with the settings and a picture beside it."""
+    overwrite: Flag = False
+    """Replace what an earlier run saved or recorded under that name."""
+    record: Annotated[Path | None, optional("FILE.oni")] = None
+    """Record what the source delivers as well: every frame, whole, skipped or not."""
+    json: Annotated[Path | None, optional("FILE.json")] = None
+    """Write the report at the end as JSON too."""
+    table: Annotated[Path | None, optional("FILE.parquet")] = None
+    """Write a row of figures for each frame, as .parquet or .csv."""
     save_model: Annotated[Path | None, optional("DIR")] = None
     """At the end, write the last model: cloud.ply, depth.png and samples.npz."""
     serve: Flag = False
@@ -192,6 +223,10 @@ class ViewerOptions:
     """Depth at the dark end of the colour scale; by default what suits the first frame."""
     far_mm: Millimetres = None
     """Depth at its bright end. Both hold for the whole run, so that colours never jump."""
+    layout: Literal["engineer", "visitor"] = "engineer"
+    """visitor: large pictures and what selecting gains; engineer: every figure of the run too."""
+    hide: Hide = ()
+    """Layers that are not shown."""
     detail: Flag = False
     """Show the kriging estimate, its variance and the long-edge triangles too."""
 
@@ -279,8 +314,16 @@ class Settings(SelectorOptions):
 
     acquire: Annotated[AcquireOptions, arg(name="")] = field(default_factory=AcquireOptions)
     run: Annotated[RunOptions, arg(name="")] = field(default_factory=RunOptions)
+    play: Annotated[PlayOptions, arg(name="")] = field(default_factory=PlayOptions)
     viewer: Annotated[ViewerOptions, arg(name="")] = field(default_factory=ViewerOptions)
 
 
-FLAT_SECTIONS = ("run", "acquire", "viewer")
+@dataclass(frozen=True)
+class LiveSettings(Settings):
+    """Those of a sensor, which is not played."""
+
+    play: Annotated[PlayOptions, Fixed, Suppress] = field(default_factory=PlayOptions)
+
+
+FLAT_SECTIONS = ("run", "acquire", "play", "viewer")
 """Sections whose options carry no prefix on the command line."""

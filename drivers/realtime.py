@@ -19,15 +19,18 @@ class RealtimeSource(DepthSource):
     ----------
     source : DepthSource
         A recording. It is owned from here on and closed with this one.
+    speed : float, default 1
+        How many times as fast as it was recorded.
     """
 
     live = True
 
-    def __init__(self, source: DepthSource) -> None:
+    def __init__(self, source: DepthSource, speed: float = 1.0) -> None:
         self._source = source
+        self._speed = speed
         self.uri = source.uri
         self.camera = source.camera
-        self.fps = source.fps
+        self.fps = source.fps * speed
         self.frame_count = source.frame_count
         self.notes = source.notes
         self.dropped = 0
@@ -71,7 +74,7 @@ class RealtimeSource(DepthSource):
             start_s = time.perf_counter()
             while not self._closing.is_set():
                 frame = self._source.read()
-                due_s = start_s + (frame.timestamp_us - first.timestamp_us) / 1e6
+                due_s = start_s + (frame.timestamp_us - first.timestamp_us) / (1e6 * self._speed)
                 if self._closing.wait(max(0.0, due_s - time.perf_counter())):
                     return
                 self._hand_over(frame)
@@ -84,6 +87,8 @@ class RealtimeSource(DepthSource):
                 self._changed.notify_all()
 
     def _hand_over(self, frame: DepthFrame) -> None:
+        if (tap := self.tap) is not None:
+            tap(frame)
         with self._changed:
             if self._newest is not None:
                 self.dropped += 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Self
 
 from selective_depth.drivers.errors import SourceEndedError, SourceError
@@ -39,6 +39,9 @@ class DepthSource(ABC):
         What a user should know of it, a sentence each: what is missing, what was assumed.
     damage : str
         Why a recording is not whole, in a sentence, where that is known before its frames are read.
+    tap : callable or None
+        Of a live source: gets every frame that it makes, whether it is read or not, on the thread that
+        takes them in: `OniRecorder.write`. It must be quick; it may be set and taken away at any time.
     """
 
     uri: str
@@ -51,6 +54,7 @@ class DepthSource(ABC):
     about: str = ""
     notes: tuple[str, ...] = ()
     damage: str = ""
+    tap: Callable[[DepthFrame], None] | None = None
     _opened_by: int
 
     def __new__(cls, *_: object, **__: object) -> Self:

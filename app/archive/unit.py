@@ -86,7 +86,7 @@ class Job:
     def stated(self) -> dict[str, Any]:
         """The settings that results depend on."""
         stated = dataclasses.asdict(self.settings)
-        del stated["viewer"], stated["run"]["threads"], stated["run"]["realtime"]
+        del stated["viewer"], stated["play"], stated["run"]["threads"], stated["run"]["no_governor"]
         file = self.settings.acquire.by.rpartition(":")[0]
         own = hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
         return stated | {"keep": repr(self.keeper), "by_file": own}

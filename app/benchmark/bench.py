@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from selective_depth.app.benchmark.peers import peer_seconds
-from selective_depth.app.commands.run import Session
+from selective_depth.app.commands.session import Session
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline import RunReport, StageSummary, open_and_tell
-from selective_depth.app.settings import RunOptions, Settings, ViewerOptions
+from selective_depth.app.settings import PlayOptions, RunOptions, Settings, ViewerOptions
 from selective_depth.selectors.improvement import ImprovementSelector
 from selective_depth.selectors.neural_gas import BatchNeuralGas, delaunay_regions, node_pixels, train_exact
 from selective_depth.selectors.parallel import default_threads
@@ -180,7 +180,8 @@ def _regions(gas: BatchNeuralGas, seeds: SeedGrid) -> object:
 def _whole_loop(source: str, frames: int | None) -> RunReport:
     with tempfile.TemporaryDirectory() as folder:
         settings = Settings(
-            run=RunOptions(frames=frames, realtime=True),
+            run=RunOptions(frames=frames, no_governor=True),
+            play=PlayOptions(realtime=True),
             viewer=ViewerOptions(headless=True, save=Path(folder) / "bench.rrd"),
         )
         session = Session(source, settings)

@@ -27,6 +27,9 @@ SAVE_S = 15.0
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 """What ends a run in good order; Windows has no SIGHUP."""
 
+before_leaving: Callable[[], None] | None = None
+"""What has to be put in order even where the program is ended at once: a terminal's mode."""
+
 _asked = threading.Event()
 _patience_s = LEAVE_S
 _deferring = False
@@ -114,6 +117,8 @@ def _watch(receive: Callable[[int], bytes]) -> None:
     while receive(1)[0] not in SIGNALS:
         pass
     time.sleep(_patience_s)
+    if before_leaving is not None:
+        before_leaving()
     os._exit(INTERRUPTED)
 
 

@@ -7,10 +7,19 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Self
+from typing import Any, Self
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.console import Console, RenderableType
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.text import Text
 
 PATIENCE_S = 2.0
 """A wait longer than this is explained."""
@@ -31,6 +40,20 @@ def waiting(why: str) -> Iterator[None]:
         timer.cancel()
 
 
+class _Bar(Progress):
+    """A progress bar with a line below it."""
+
+    def __init__(self, *columns: ProgressColumn, hint: str, **options: Any) -> None:
+        self._hint = hint
+        super().__init__(*columns, **options)
+
+    def get_renderables(self) -> Iterator[RenderableType]:
+        """The bar, and the line."""
+        yield from super().get_renderables()
+        if self._hint:
+            yield Text(self._hint, style="dim")
+
+
 class FrameProgress:
     """How far a run has come: a bar on a terminal, now and then a line elsewhere.
 
@@ -40,13 +63,15 @@ class FrameProgress:
         What is running.
     total : int or None
         Frames in all; None where nobody knows.
+    hint : str, optional
+        Below the bar on a terminal: the keys that there are.
     """
 
-    def __init__(self, what: str, total: int | None) -> None:
+    def __init__(self, what: str, total: int | None, hint: str = "") -> None:
         self._what, self._total = what, total
         self._start_s = self._said_s = time.monotonic()
         self._drawn = sys.stderr.isatty()
-        self._bar = Progress(
+        self._bar = _Bar(
             SpinnerColumn(),
             TextColumn("{task.description}"),
             *((BarColumn(),) if total else ()),
@@ -56,6 +81,7 @@ class FrameProgress:
             TextColumn("{task.fields[note]}"),
             console=Console(stderr=True),
             transient=True,
+            hint=hint,
             disable=not self._drawn,
         )
         self._task = self._bar.add_task(what, total=total, note="")

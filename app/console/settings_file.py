@@ -11,7 +11,7 @@ from typing import Any
 import tomli_w
 
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.settings import FLAT_SECTIONS, Settings
+from selective_depth.app.settings import FLAT_SECTIONS, PlayOptions, Settings
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "paper": {
@@ -31,11 +31,14 @@ LARGEST_BYTES = 1 << 20
 def to_toml(settings: Settings, *heading: str) -> str:
     """Settings as TOML that `--settings` reads back, under a heading of comments.
 
-    Where the results went, ``save``, is none of the settings: another run with them must not
-    replace these.
+    Where the results went, as ``save``, is none of the settings: another run with them must not
+    replace these. How a recording was played is left out where it was just played, for a sensor is not.
     """
     tables = dataclasses.asdict(settings)
-    del tables["viewer"]["save"], tables["viewer"]["save_model"]
+    for name in ("save", "save_model", "overwrite", "record", "json", "table"):
+        del tables["viewer"][name]
+    if settings.play == PlayOptions():
+        tables["play"] = {}
     flat = {key: value for name in FLAT_SECTIONS for key, value in tables.pop(name).items()}
     told = "".join(f"# {_one_line(line)}\n" for line in heading)
     return told + tomli_w.dumps(_stated({"schema": SCHEMA} | flat | tables))

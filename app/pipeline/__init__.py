@@ -2,8 +2,17 @@
 
 from selective_depth.app.pipeline.feed import Feed, Read, open_and_tell, state_of
 from selective_depth.app.pipeline.figures import figures_of
+from selective_depth.app.pipeline.governor import Governor
 from selective_depth.app.pipeline.pipeline import Pipeline
-from selective_depth.app.pipeline.report import RunReport, is_settings, print_report, save_settings, say
+from selective_depth.app.pipeline.report import (
+    RunReport,
+    gain_of,
+    is_settings,
+    mean_of,
+    print_report,
+    save_settings,
+    say,
+)
 from selective_depth.app.pipeline.result import FrameResult, Model, SensorNote
 from selective_depth.app.pipeline.timing import STAGES, StageSummary, StageTimes
 
@@ -11,6 +20,7 @@ __all__ = [
     "STAGES",
     "Feed",
     "FrameResult",
+    "Governor",
     "Model",
     "Pipeline",
     "Read",
@@ -19,7 +29,9 @@ __all__ = [
     "StageSummary",
     "StageTimes",
     "figures_of",
+    "gain_of",
     "is_settings",
+    "mean_of",
     "open_and_tell",
     "print_report",
     "save_settings",

@@ -79,5 +79,8 @@ class Feed:
             except (SourceTimeoutError, DeviceLostError):
                 if not source.live:
                     raise
-            taken += frame is not None
+            if frame is not None:
+                taken += 1
+                if not source.live and source.tap is not None:
+                    source.tap(frame)
             yield Read(frame, state_of(source), (time.perf_counter() - start_s) * 1000)

@@ -32,5 +32,5 @@ def figures_of(result: FrameResult) -> dict[str, float]:
         "mae_mm": nan if model is None else model.mae_mm,
         "truth_rmse_mm": nan if model is None else model.truth_rmse_mm,
         "sensor_rmse_mm": nan if model is None else model.sensor_rmse_mm,
-        "even_rmse_mm": nan if model is None else model.even_rmse_mm,
+        "even_rmse_mm": nan if model is None or model.even is None else model.even.rmse_mm,
     }

@@ -7,31 +7,36 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
-import numpy as np
-
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.pipeline.result import FrameResult, Model
-from selective_depth.app.pipeline.selecting import gas_of, improvement_of, selector_of
+from selective_depth.app.pipeline.governor import ALL, Eased
+from selective_depth.app.pipeline.result import Even, FrameResult, Model
+from selective_depth.app.pipeline.selecting import NAMES, gas_of, improvement_of, selector_of
 from selective_depth.app.pipeline.timing import StageTimes
 from selective_depth.app.pipeline.warm_up import compiling_beside
-from selective_depth.app.settings import Settings
+from selective_depth.app.settings import AcquireOptions, Settings
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import Acquisition, acquire
-from selective_depth.selectors.even import even_lattice
 from selective_depth.selectors.improvement import ImprovementSelection
 from selective_depth.selectors.memory import TemporalAcquisition, TemporalStep
 from selective_depth.selectors.neural_gas import RegionSelection
-from selective_depth.selectors.quality import errors_of
-from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.selection import Selector, Worth
 
-EVEN_EVERY = 10
-"""Of a recording's frames, one in so many is measured evenly as well, to tell what selecting gains."""
-MODEL_EVERY = 10
-"""Of a sensor's frames, one in so many gets a dense model: at 30 frames/s, one of every frame
-would take most of a core, which the frames themselves need."""
+EVEN_EVERY, EVEN_EVERY_LIVE = 10, 3
+"""One in so many frames of a recording, or of a sensor, is measured evenly as well, to tell what selecting
+gains; a sensor's are for people who look on, a recording's for its report."""
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What holds for the frames that are begun from now on."""
+
+    settings: Settings
+    selector: Selector | Worth
+    eased: Eased = ALL
 
 
 class _AtOnce(Executor):
@@ -57,8 +62,8 @@ class Pipeline:
     settings : Settings
         Options of the seeds, the selectors and the acquisition.
     realtime : bool, default False
-        Frames come whether the pipeline is ready or not. Then the dense model of every
-        `MODEL_EVERY`-th is made beside it, and the other frames have none.
+        Frames come whether the pipeline is ready or not: none waits for the even lattice's model,
+        which the first frame after it is made gets.
     one_thread : bool, default False
         Make every frame in the calling thread, one after the other: where each processor has a
         process of its own.
@@ -72,41 +77,81 @@ class Pipeline:
     """
 
     def __init__(self, settings: Settings, *, realtime: bool = False, one_thread: bool = False) -> None:
-        self._overlap = 0 if one_thread else int(settings.acquire.budget > 0 or not realtime)
-        self._threads = settings.run.threads or (1 if self._overlap or one_thread else None)
+        self._realtime = realtime
+        self._one_thread = one_thread
         self.times = StageTimes()
-        self._settings = settings
         self._live_gas = settings.gas.training == "live"
+        self._overlap = int(not one_thread and (settings.acquire.budget > 0 or not realtime))
+        self._threads = settings.run.threads or (1 if self._overlap or one_thread else None)
         self._gas = gas_of(settings, self._threads)
         self._improvement = improvement_of(settings, self._threads)
-        self._selector = selector_of(settings, self._threads)
-        self._remembers = settings.acquire.memory == "still"
-        if self._remembers and not settings.acquire.budget:
-            raise UsageError("--memory still spends a --budget in every frame; give one, such as 2%.")
         self._memory: TemporalAcquisition | None = None
-        self._realtime = realtime
+        self._asked = self._ask(settings)
+        self._regions: RegionSelection | None = None
         # The stages are compiled and free of the GIL: side by side they take as long as the
         # longest of them.
         self._beside: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(2, thread_name_prefix="beside")
-        self._modelling = ThreadPoolExecutor(1, thread_name_prefix="model")
+        self._evening: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(1, thread_name_prefix="even")
         self._under_way: deque[Callable[[], FrameResult]] = deque()
-        self._pending: Future[Model] | None = None
-        self._since_model = MODEL_EVERY
+        self._even: Future[Even] | None = None
+        self._counted: int | None = None
+        self._begun = 0
+
+    def _ask(self, settings: Settings) -> _Asked:
+        if settings.acquire.memory == "still" and not settings.acquire.budget:
+            raise UsageError("--memory still spends a --budget in every frame; give one, such as 2%.")
+        return _Asked(settings, selector_of(settings, self._threads))
+
+    def adopt(self, settings: Settings) -> None:
+        """Take other options of the acquisition, for the frames that are begun from now on.
+
+        What a memory knows is kept, unless it is switched off or spends another budget.
+
+        Raises
+        ------
+        UsageError
+            As when made; nothing has changed then.
+        """
+        before, asked = self._asked.settings.acquire, self._ask(settings)
+        self._asked = replace(asked, eased=self._asked.eased)
+        self._overlap = int(not self._one_thread and (settings.acquire.budget > 0 or not self._realtime))
+        if before != settings.acquire:
+            self._memory = None
+
+    def ease(self, eased: Eased) -> None:
+        """Do less, or all again, of every frame that is begun from now on: see `Governor`."""
+        self._asked = replace(self._asked, eased=eased)
+
+    def forget(self) -> None:
+        """Forget what a memory knows and where the nodes are: the next frame is the first."""
+        self._memory = None
+        self._gas = gas_of(self._asked.settings, self._threads)
 
     def warm_up(self, frame: DepthFrame) -> None:
         """Compile the kernels, fill the tables and train the first nodes, untimed."""
         with compiling_beside():
             self._improvement.select(self._seeds(frame))
         self.make(frame)
-        if self._pending is not None:
-            self._pending.result()
-        self._memory = None
+        self._start_afresh()
+
+    def warm_up_all(self, frame: DepthFrame) -> None:
+        """Compile what other options than the present ones run, so that changing them takes no time."""
+        kept = self._asked
+        for other in switched(kept.settings.acquire):
+            self.adopt(replace(kept.settings, acquire=other))
+            for _ in range(2):  # a memory's second frame is what goes on
+                self.make(frame)
+        self.adopt(kept.settings)
+        self._start_afresh()
+
+    def _start_afresh(self) -> None:
+        self._memory, self._even, self._counted, self._begun = None, None, None, 0
         self.times.clear()
 
     def train(self, frame: DepthFrame) -> None:
         """Train the first nodes alone, as `warm_up` leaves them, where all is compiled already."""
         if self._live_gas:
-            self._regions(self._seeds(frame), {})
+            self._gas_of(self._seeds(frame), {})
             self.times.clear()
 
     def make(self, frame: DepthFrame) -> FrameResult:
@@ -127,22 +172,26 @@ class Pipeline:
             How long the frame was waited for.
         """
         start_s = time.perf_counter()
-        stages_ms = {"read": read_ms}
+        asked, stages_ms = self._asked, {"read": read_ms}
         if math.isfinite(read_ms):
             self.times.add("read", read_ms)
         step: TemporalStep | None = None
         modelling: Future[tuple[Acquisition | None, Model | None]]
-        if self._remembers:
-            step = self._remember(frame, stages_ms)
+        if asked.settings.acquire.memory == "still":
+            step = self._remember(asked, frame, stages_ms)
             seeds = step.seeds
             modelling = self._beside.submit(self._told_by, step, frame, stages_ms)
         else:
             with self.times.stage("seeds", stages_ms):
                 seeds = self._seeds(frame)
-            modelling = self._beside.submit(self._acquire_and_model, frame, seeds, stages_ms)
+            draws = self._begun % asked.eased.model_every == 0
+            modelling = self._beside.submit(self._acquire_and_model, asked, frame, seeds, draws, stages_ms)
         improving = self._beside.submit(self._improve, seeds, stages_ms)
         # In this thread, for the training of a frame begins where the last one's ended.
-        regions = self._regions(seeds, stages_ms)
+        if self._regions is None or self._begun % asked.eased.gas_every == 0:
+            self._regions = self._gas_of(seeds, stages_ms)
+        regions = self._regions
+        self._begun += 1
         begun_ms = (time.perf_counter() - start_s) * 1000
 
         def finish() -> FrameResult:
@@ -150,8 +199,8 @@ class Pipeline:
             start_s = time.perf_counter()
             improvement = improving.result()
             acquisition, model = modelling.result()
-            if acquisition is not None and model is None:
-                model = self._model_of_some(frame, acquisition)
+            if acquisition is not None and model is not None:
+                model = self._beside_even(asked, frame, model, len(acquisition.uv))
             loop_ms = begun_ms + (time.perf_counter() - start_s) * 1000
             self.times.add("loop", loop_ms)
             return FrameResult(
@@ -179,10 +228,10 @@ class Pipeline:
             yield self._under_way.popleft()()
 
     def _seeds(self, frame: DepthFrame) -> SeedGrid:
-        options = self._settings.seeds
+        options = self._asked.settings.seeds
         return SeedGrid.from_frame(frame, (options.rows, options.columns))
 
-    def _regions(self, seeds: SeedGrid, stages_ms: dict[str, float]) -> RegionSelection:
+    def _gas_of(self, seeds: SeedGrid, stages_ms: dict[str, float]) -> RegionSelection:
         with self.times.stage("neural_gas", stages_ms):
             return self._gas.update(seeds) if self._live_gas else self._gas.select(seeds)
 
@@ -191,27 +240,28 @@ class Pipeline:
             return self._improvement.select(seeds)
 
     def _acquire_and_model(
-        self, frame: DepthFrame, seeds: SeedGrid, stages_ms: dict[str, float]
+        self, asked: _Asked, frame: DepthFrame, seeds: SeedGrid, draws: bool, stages_ms: dict[str, float]
     ) -> tuple[Acquisition | None, Model | None]:
-        options = self._settings.acquire
+        options = asked.settings.acquire
         if options.budget == 0:
             return None, None
+        rounds = min(options.rounds, asked.eased.rounds)
         with self.times.stage("acquire", stages_ms):
-            acquisition = acquire(
-                frame.measure, seeds, options.budget, options.rounds, self._selector, threads=self._threads
-            )
-        model = None if self._realtime else self._model(frame, acquisition, stages_ms)
-        return acquisition, model
+            acquisition = acquire(frame.measure, seeds, options.budget, rounds, asked.selector, threads=self._threads)
+        if not draws:
+            return acquisition, None
+        with self.times.stage("model", stages_ms):
+            return acquisition, Model.of(acquisition.reconstruct(self._threads), frame)
 
-    def _remember(self, frame: DepthFrame, stages_ms: dict[str, float]) -> TemporalStep:
-        options, seeds = self._settings.acquire, self._settings.seeds
+    def _remember(self, asked: _Asked, frame: DepthFrame, stages_ms: dict[str, float]) -> TemporalStep:
+        options, seeds = asked.settings.acquire, asked.settings.seeds
         if self._memory is None:
             self._memory = TemporalAcquisition(
                 frame.shape,
                 budget=float(options.budget),
                 seeds=(seeds.rows, seeds.columns),
                 rounds=max(options.rounds, 2),
-                selector=None if options.by == "auto" else self._selector,
+                selector=None if options.by == "auto" else asked.selector,
                 camera=frame.camera,
                 threads=self._threads,
             )
@@ -222,37 +272,37 @@ class Pipeline:
         """What the memory measured in a frame, and its model held against it."""
         with self.times.stage("model", stages_ms):
             acquisition = Acquisition(step.uv, step.depth_mm, step.batch, frame.shape, (), f"{step.by}, with memory")
-            return acquisition, Model.of(step.model_mm, frame, self._even_rmse_mm(frame, len(step.uv)))
+            return acquisition, Model.of(step.model_mm, frame)
 
-    def _model_of_some(self, frame: DepthFrame, acquisition: Acquisition) -> Model | None:
-        """Begin a model now and then, and return it when it is made."""
-        self._since_model += 1
-        done = self._pending if self._pending and self._pending.done() else None
-        if done:
-            self._pending = None
-        if self._pending is None and self._since_model >= MODEL_EVERY:
-            self._pending = self._modelling.submit(self._model, frame, acquisition)
-            self._since_model = 0
-        return done.result() if done else None
-
-    def _model(self, frame: DepthFrame, acquisition: Acquisition, stages_ms: dict[str, float] | None = None) -> Model:
-        with self.times.stage("model", stages_ms):
-            depth_mm = acquisition.reconstruct(self._threads)
-            return Model.of(depth_mm, frame, self._even_rmse_mm(frame, len(acquisition.uv)))
-
-    def _even_rmse_mm(self, frame: DepthFrame, measurements: int) -> float:
-        """What an even lattice of so many measurements would be off, for one in `EVEN_EVERY` frames."""
-        if frame.index % EVEN_EVERY and (self._remembers or not self._realtime):
-            return math.nan
-        truth_mm = frame.truth_mm if self._remembers and frame.truth_mm is not None else frame.depth_mm
-        seen_mm = np.where(frame.depth_mm > 0, truth_mm, 0)
-        uv = even_lattice(frame.shape, measurements)
-        even_mm = reconstruct(uv, frame.measure(uv), frame.shape, threads=self._threads)
-        return errors_of(even_mm, seen_mm).rmse_mm if seen_mm.any() else math.nan
+    def _beside_even(self, asked: _Asked, frame: DepthFrame, model: Model, measurements: int) -> Model:
+        """Now and then an even lattice's model is made as well; the model's frame gets it when it is there."""
+        options = asked.settings.acquire
+        usual = EVEN_EVERY_LIVE if self._realtime else EVEN_EVERY
+        every = usual if options.even_every is None else options.even_every
+        if self._counted is None:  # of a recording by its own numbers, so that parts of it make what the whole makes
+            self._counted = 0 if self._realtime else frame.index
+        due = bool(every) and self._counted % (every * asked.eased.model_every) == 0
+        self._counted += 1
+        if due and self._even is None:
+            to_truth = options.memory == "still" and frame.truth_mm is not None
+            self._even = self._evening.submit(Even.of, frame, measurements, to_truth, self._threads)
+        if self._even is None or (self._realtime and not self._even.done()):
+            return model
+        even, self._even = self._even.result(), None
+        return replace(model, even=even)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         self._beside.shutdown(cancel_futures=True)
-        self._modelling.shutdown(cancel_futures=True)
+        self._evening.shutdown(cancel_futures=True)
+
+
+def switched(options: AcquireOptions) -> Iterator[AcquireOptions]:
+    """The same acquisition by each selector, and remembered: what is switched between while a run goes on."""
+    spending = replace(options, budget=options.budget or 0.01, rounds=2, memory="off", even_every=0)
+    for by in NAMES[1:]:
+        yield replace(spending, by=by)
+    yield replace(spending, by="auto", rounds=1)
+    yield replace(spending, by="auto", memory="still", even_every=1)

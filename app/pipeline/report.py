@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
 from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +21,8 @@ from selective_depth.app.pipeline.result import FrameResult
 from selective_depth.app.pipeline.timing import StageSummary
 from selective_depth.app.settings import Settings
 
+SCHEMA = 1
+"""Version of the JSON's keys."""
 HEADING = "Settings of a run of selective-depth"
 
 
@@ -40,6 +45,14 @@ class Mean:
         return self.total / self.count if self.count else math.nan
 
 
+def mean_of(values: Iterable[float]) -> float:
+    """Mean of the finite ones of some values; NaN of none."""
+    mean = Mean()
+    for value in values:
+        mean.add(value)
+    return mean.value
+
+
 @dataclass
 class RunReport:
     """Figures of a run, gathered frame by frame.
@@ -59,7 +72,13 @@ class RunReport:
     by : str
         What drove the shots; empty without a budget.
     means : dict of str to Mean
-        Of the results' figures, by name, and of "spent", the share of the pixels measured.
+        Of the results' figures, by name, since the options were changed last.
+    changes : int
+        How often they were changed on the way.
+    recorded : dict of Path to (int, float)
+        Files that were recorded on the way: frames, and for how many seconds.
+    given_up : str
+        What the governor left out at most, and in how many frames; empty if it was nothing.
     """
 
     source: str
@@ -72,9 +91,12 @@ class RunReport:
     stages: dict[str, StageSummary] = field(default_factory=dict)
     state: str = ""
     by: str = ""
+    given_up: str = ""
     means: dict[str, Mean] = field(default_factory=lambda: defaultdict(Mean))
     troubles: list[str] = field(default_factory=list)
     written: list[Path] = field(default_factory=list)
+    recorded: dict[Path, tuple[int, float]] = field(default_factory=dict)
+    changes: int = 0
 
     @property
     def fps(self) -> float:
@@ -84,13 +106,7 @@ class RunReport:
     @property
     def gain(self) -> str:
         """What selecting was worth, in a line; empty where nothing was held against an even lattice."""
-        means = self.means
-        if not means["even_rmse_mm"].count:
-            return ""
-        remembered = means["known_percent"].count and means["truth_rmse_mm"].count
-        rmse_mm, even_mm = means["truth_rmse_mm" if remembered else "rmse_mm"].value, means["even_rmse_mm"].value
-        spent = f"{means['measured_percent'].value:.1f}% of the pixels · {rmse_mm:.1f} mm"
-        return f"{spent} · even lattice {even_mm:.1f} mm · {even_mm / max(rmse_mm, 1e-9):.1f} times as good"
+        return gain_of({name: mean.value for name, mean in self.means.items()})
 
     def take(self, result: FrameResult) -> None:
         """Add a frame's result, with its figures."""
@@ -99,6 +115,41 @@ class RunReport:
             self.means[name].add(value)
         if result.acquisition is not None:
             self.by = result.acquisition.by
+
+    def begin_anew(self) -> None:
+        """Options have changed: the figures are those of what comes from now on."""
+        self.changes += 1
+        self.means.clear()
+
+    def to_json(self, settings: Settings) -> str:
+        """The report and the settings as JSON; what nobody knows is null."""
+        content = vars(self) | {
+            "schema": SCHEMA,
+            "gain": self.gain,
+            "fps": self.fps,
+            "means": {name: mean.value if mean.count else None for name, mean in self.means.items()},
+            "stages": {name: dataclasses.asdict(times) for name, times in self.stages.items()},
+            "recorded": {str(path): {"frames": n, "seconds": s} for path, (n, s) in self.recorded.items()},
+            "settings": dataclasses.asdict(settings),
+        }
+        return json.dumps(content, indent=2, default=str) + "\n"
+
+
+def gain_of(figures: Mapping[str, float]) -> str:
+    """What selecting was worth, in a line, by the figures of `figures_of` or their means; empty if nobody knows.
+
+    With a memory it is the error to the truth, where that is known, as the even lattice's is then.
+    """
+    nan = math.nan
+    remembers = math.isfinite(figures.get("known_percent", nan)) and math.isfinite(figures.get("truth_rmse_mm", nan))
+    rmse_mm = figures.get("truth_rmse_mm" if remembers else "rmse_mm", nan)
+    even_mm, measured = figures.get("even_rmse_mm", nan), figures.get("measured_percent", nan)
+    if not math.isfinite(rmse_mm + even_mm + measured):
+        return ""
+    times = even_mm / max(rmse_mm, 1e-9)
+    return (
+        f"{measured:.1f}% of the pixels · {rmse_mm:.1f} mm · even lattice {even_mm:.1f} mm · {times:.1f} times as good"
+    )
 
 
 def say(sentence: str) -> None:
@@ -127,6 +178,10 @@ def print_report(report: RunReport) -> None:
     ):
         if means[name].count:
             rows.append((title, f"{means[name].value:.1f}", unit))
+    if report.changes:
+        rows.append(("options changed", f"{report.changes:,}", "times; the figures are since the last"))
+    if report.given_up:
+        rows.append(("left out to keep up", report.given_up, ""))
     if means["known_percent"].count:
         rows.append(("pixels known", f"{means['known_percent'].value:.1f}%", "on average"))
     print_table(rows, justify="lrl")
@@ -138,9 +193,19 @@ def print_report(report: RunReport) -> None:
     if report.written:
         console.print()
     for path in report.written:
-        console.print(f"wrote {path}", soft_wrap=True)
+        console.print(f"wrote {path}{_size(path, report)}", soft_wrap=True)
     for trouble in report.troubles:
         console.print(f"note: {trouble}", soft_wrap=True)
+
+
+def _size(path: Path, report: RunReport) -> str:
+    """How large a recording is, and how fast it grew."""
+    frames, seconds = report.recorded.get(path, (0, report.seconds if path.suffix == ".rrd" else 0.0))
+    if not seconds or not path.is_file():
+        return ""
+    size = path.stat().st_size
+    count = f"{frames:,} frames, " if frames else ""
+    return f" ({count}{size / 1e6:,.1f} MB, {size / 1e6 * 60 / seconds:,.0f} MB a minute)"
 
 
 def is_settings(path: Path) -> bool:

@@ -8,12 +8,41 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.app.settings import ViewerOptions
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import Acquisition
+from selective_depth.selectors.even import even_lattice
 from selective_depth.selectors.improvement import ImprovementSelection
 from selective_depth.selectors.memory import TemporalStep
 from selective_depth.selectors.neural_gas import RegionSelection
+from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.seeds import SeedGrid
+
+
+@dataclass(frozen=True, eq=False)
+class Even:
+    """The dense model of an even lattice of as many measurements as were spent by selection.
+
+    Parameters
+    ----------
+    depth_mm : float32 array of shape (height, width)
+        Depth at every pixel.
+    error_mm : float32 array of shape (height, width)
+        As of `Model`.
+    rmse_mm : float
+        As of `Model`; or, where that is asked for, against the truth.
+    """
+
+    depth_mm: npt.NDArray[np.float32]
+    error_mm: npt.NDArray[np.float32]
+    rmse_mm: float
+
+    @classmethod
+    def of(cls, frame: DepthFrame, measurements: int, to_truth: bool = False, threads: int | None = None) -> Even:
+        """Measure a frame evenly and model it."""
+        uv = even_lattice(frame.shape, measurements)
+        made = Model.of(reconstruct(uv, frame.measure(uv), frame.shape, threads=threads), frame)
+        return cls(made.depth_mm, made.error_mm, made.truth_rmse_mm if to_truth else made.rmse_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +60,11 @@ class Model:
     truth_rmse_mm, sensor_rmse_mm : float
         The same of the model and of the full frame against exact truth, over pixels of the frame
         with depth; NaN where no truth is known.
-    even_rmse_mm : float
-        The same as `rmse_mm`, or with a memory as `truth_rmse_mm`, of an even lattice of as many
-        measurements; NaN where none was made.
     mae_mm : float
         Mean of `error_mm`; NaN for a frame without depth.
+    even : Even or None
+        The even lattice's, where one was made: of this frame, or of one shortly before it where
+        frames do not wait.
     """
 
     depth_mm: npt.NDArray[np.float32]
@@ -43,11 +72,11 @@ class Model:
     rmse_mm: float
     truth_rmse_mm: float = math.nan
     sensor_rmse_mm: float = math.nan
-    even_rmse_mm: float = math.nan
     mae_mm: float = math.nan
+    even: Even | None = None
 
     @classmethod
-    def of(cls, depth_mm: npt.NDArray[np.float32], frame: DepthFrame, even_rmse_mm: float = math.nan) -> Model:
+    def of(cls, depth_mm: npt.NDArray[np.float32], frame: DepthFrame) -> Model:
         """A model and what it is off from its frame and from the truth."""
         known = frame.depth_mm > 0
         error_mm = np.abs(depth_mm - frame.depth_mm.astype(np.float32))
@@ -59,7 +88,7 @@ class Model:
             to_truth = _rms(depth_mm[seen] - truth_mm), _rms(frame.depth_mm[seen] - truth_mm)
         off_mm = error_mm[known]
         mae_mm = float(off_mm.mean(dtype=np.float64)) if off_mm.size else math.nan
-        return cls(depth_mm, error_mm, _rms(off_mm), *to_truth, even_rmse_mm, mae_mm)
+        return cls(depth_mm, error_mm, _rms(off_mm), *to_truth, mae_mm)
 
 
 def _rms(off_mm: npt.NDArray[np.floating]) -> float:
@@ -83,19 +112,23 @@ class FrameResult:
     acquisition : Acquisition or None
         Seeds and what was measured besides; None without a budget.
     model : Model or None
-        The dense model, where one is at hand: of this frame, or of one shortly before it where
-        frames do not wait.
+        The dense model, where one was made.
     memory : TemporalStep or None
         What the memory came to, where there is one; then `seeds` are what it knows of them, and
         `acquisition` what was measured in this frame.
     state : str
         The sensor's: live, stalled, lost, reconnecting; or replay.
     stages_ms : dict of str to float
-        Duration of each stage in milliseconds: this frame's own, but for `log`, and for `model`
-        where frames do not wait; those are the latest.
+        Duration of each stage in milliseconds: this frame's own, but for `log`, which is the latest.
     figures : dict of str to float
         Running figures by name: a run adds those of `figures_of`, its rate and its drops before it
         hands the result on.
+    gain : str
+        What selecting was worth over the last second, in a line; empty where nobody knows.
+    given_up : str
+        What the governor leaves out, in a few words; empty if it is nothing.
+    look : ViewerOptions or None
+        How it is to be shown, where that changes on the way.
 
     Attributes
     ----------
@@ -113,6 +146,9 @@ class FrameResult:
     state: str = "replay"
     stages_ms: dict[str, float] = field(default_factory=dict)
     figures: dict[str, float] = field(default_factory=dict)
+    gain: str = ""
+    given_up: str = ""
+    look: ViewerOptions | None = None
 
     @property
     def samples(self) -> int:

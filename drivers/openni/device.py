@@ -117,9 +117,7 @@ class OpenNIDevice(DepthSource):
     settings : DeviceSettings, optional
         Default 640x480 at 30 fps, not mirrored, not registered.
     tap : callable, optional
-        Gets every frame that the sensor made, on the thread that takes them in, whether it is read
-        or not: `OniRecorder.write`. It must be quick.
-
+        Its `tap` from the first frame on.
     intrinsics : (float, float, float, float), optional
         fx, fy, cx, cy in pixels; default from the field of view that the driver states.
     colouring : Colouring, optional
@@ -168,7 +166,7 @@ class OpenNIDevice(DepthSource):
         self.misfits = 0
         self.state_reason = ""
         self._wanted_uri = device_uri
-        self._tap = tap
+        self.tap = tap
         self._changed = threading.Condition()
         self._closing = threading.Event()
         self._newest: DepthFrame | None = None
@@ -394,8 +392,8 @@ class OpenNIDevice(DepthSource):
             if self._first is None:
                 self._first = frame.index
             frame = replace(frame, index=frame.index - self._first)
-            if self._tap is not None:
-                self._tap(frame)
+            if (tap := self.tap) is not None:
+                tap(frame)
             with self._changed:
                 self.state, self.state_reason = "live", ""
                 self._newest = frame

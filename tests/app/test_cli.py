@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import random
 import re
@@ -22,12 +23,13 @@ from rerun.chunk import RrdReader
 from virtual_sensor import VirtualSensor
 
 from selective_depth.app import cli
-from selective_depth.app.commands import run as session
+from selective_depth.app.archive.table import rows_of
+from selective_depth.app.commands import run
 from selective_depth.app.console import dispatch
 from selective_depth.app.console.command import COMMANDS, SHELLS, parse
 from selective_depth.app.console.settings_file import to_toml
 from selective_depth.app.pipeline import save_settings
-from selective_depth.app.settings import MOST_ROUNDS, GasOptions, RunOptions, Settings, ViewerOptions
+from selective_depth.app.settings import MOST_ROUNDS, GasOptions, PlayOptions, RunOptions, Settings, ViewerOptions
 from selective_depth.app.viewer import sinks as places
 from selective_depth.drivers.errors import OutputError
 
@@ -226,7 +228,8 @@ def test_help_in_hardly_any_columns(
 
 def test_settings_survive_the_round_trip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = Settings(
-        run=RunOptions(frames=7, realtime=True),
+        run=RunOptions(frames=7),
+        play=PlayOptions(realtime=True),
         gas=GasOptions(nodes=500, algorithm="exact", factor=1.25),
         viewer=ViewerOptions(save=Path('a "b" c.rrd'), near_mm=400),
     )
@@ -234,7 +237,7 @@ def test_settings_survive_the_round_trip(tmp_path: Path, monkeypatch: pytest.Mon
     path.write_text(to_toml(settings, 'a "heading"', "of two lines"))
     assert tomllib.loads(path.read_text())["gas"]["nodes"] == settings.gas.nodes
     heard: list[Settings] = []
-    monkeypatch.setattr(session, "watch", lambda source, settings: heard.append(settings) or 0)
+    monkeypatch.setattr(run, "watch", lambda source, settings: heard.append(settings) or 0)
     assert cli.run(["replay", "x", "--settings", str(path)]) == 0
     assert cli.run(["replay", "x", "--settings", str(path), "--gas.nodes", "99"]) == 0
     viewer = dataclasses.replace(settings.viewer, save=None)  # that run's results are that run's
@@ -358,11 +361,60 @@ def test_saving_never_replaces_what_is_of_no_earlier_run(
     assert [path.read_text() for path in tmp_path.iterdir()] == ["precious"]
 
 
-def test_saving_replaces_an_earlier_run(tmp_path: Path) -> None:
-    for _ in range(2):
-        arguments = ["replay", ENDLESS, *QUICK, "--frames", "2", "--save", str(tmp_path / "a.rrd")]
-        assert cli.run(arguments) == 0
+def test_saving_replaces_an_earlier_run_when_asked_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["replay", ENDLESS, *QUICK, "--frames", "2", "--save", str(tmp_path / "a.rrd")]
+    assert cli.run(arguments) == 0
+    before = (tmp_path / "a.rrd").read_bytes()
+    assert "exists already; give another name, or --overwrite" in refuse(capsys, *arguments)[1]
+    assert (tmp_path / "a.rrd").read_bytes() == before
+    assert cli.run([*arguments, "--overwrite"]) == 0
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_run_that_keeps_nothing_says_so(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    arguments = ["replay", ENDLESS, *QUICK, "--frames", "2"]
+    assert cli.run(arguments) == 0
+    assert "Nothing is kept of this run but the report" in capsys.readouterr().out
+    assert cli.run([*arguments, "--json", str(tmp_path / "a.json")]) == 0
+    assert "Nothing is kept" not in capsys.readouterr().out
+
+
+def test_the_report_as_json_says_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["replay", ENDLESS, *QUICK, "--frames", "3", "--budget", "5%", "--json", str(tmp_path / "a.json")]
+    assert cli.run([*arguments, "--table", str(tmp_path / "a.parquet")]) == 0
+    shown = capsys.readouterr().out
+    said = json.loads((tmp_path / "a.json").read_text())
+    assert said["gain"] and said["gain"] in shown
+    assert (said["frames"], said["schema"], said["by"]) == (3, 1, "surface score")
+    assert said["settings"]["acquire"]["budget"] == 0.05 and "loop" in said["stages"]
+    rows = list(rows_of(tmp_path / "a.parquet"))
+    assert [row["frame"] for row in rows] == [0, 1, 2]
+    assert rows[0]["even_rmse_mm"] == pytest.approx(said["means"]["even_rmse_mm"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (("replay", ENDLESS, "--rounds", "4"), "--rounds is 4, but nothing is spent in them; give a --budget"),
+        (("replay", ENDLESS, "--table", "a.csv"), "--table is 'a.csv'; it must end in .parquet"),
+        (("live", "--loop"), "'live' does not take --loop"),
+        (("replay", ENDLESS, "--speed", "0"), "--speed is 0; it must be more than 0"),
+    ],
+)
+def test_what_would_do_nothing_is_refused(
+    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], why: str
+) -> None:
+    code, said = refuse(capsys, *arguments)
+    assert code == 2 and why in said
+
+
+def test_settings_of_a_replay_are_those_of_a_sensor_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(to_toml(Settings(gas=GasOptions(nodes=500))))
+    heard: list[Settings] = []
+    monkeypatch.setattr(run, "watch", lambda source, settings: heard.append(settings) or 0)
+    assert cli.run(["live", "--settings", str(path)]) == 0
+    assert heard[0].gas.nodes == 500
 
 
 def test_a_save_that_fails_at_its_end_is_a_failed_run(

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +18,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from selective_depth.app import cli
-from selective_depth.app.commands import run as session_module
-from selective_depth.app.commands.run import Session
+from selective_depth.app.commands import session as session_module
+from selective_depth.app.commands.session import Session
 from selective_depth.app.console import interrupt
 from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes, timing
-from selective_depth.app.pipeline.pipeline import MODEL_EVERY, Pipeline
+from selective_depth.app.pipeline.governor import Eased
+from selective_depth.app.pipeline.pipeline import EVEN_EVERY_LIVE, Pipeline
+from selective_depth.app.pipeline.result import Even
 from selective_depth.app.settings import AcquireOptions, GasOptions, RunOptions, SeedOptions, Settings, ViewerOptions
 from selective_depth.app.viewer import Viewer
 from selective_depth.drivers.errors import (
@@ -35,6 +38,9 @@ from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.realtime import RealtimeSource
 from selective_depth.drivers.source import DepthSource
 from selective_depth.selectors.acquire import Acquisition
+from selective_depth.selectors.even import even_lattice
+from selective_depth.selectors.quality import errors_of
+from selective_depth.selectors.reconstruct import reconstruct
 
 HEIGHT, WIDTH = 48, 64
 SMALL = Settings(seeds=SeedOptions(24, 32), gas=GasOptions(nodes=60), viewer=ViewerOptions(headless=True))
@@ -180,14 +186,6 @@ def test_what_is_lost_while_starting_is_counted_apart(monkeypatch: pytest.Monkey
     assert (session.report.dropped_starting, session.report.dropped) == (7, 2)
 
 
-def test_a_live_loop_makes_the_model_of_some_frames_only() -> None:
-    settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, rounds=2))
-    with Pipeline(settings, realtime=True) as pipeline:
-        for index in range(3 * MODEL_EVERY):
-            pipeline.make(make_frame(index))
-    assert 1 <= pipeline.times.summary()["model"].count <= 3
-
-
 ACQUIRING = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, rounds=2))
 
 
@@ -198,13 +196,63 @@ def test_a_model_has_no_error_where_the_frame_has_no_depth() -> None:
     np.testing.assert_array_equal(np.isnan(step.model.error_mm), step.frame.depth_mm == 0)
 
 
-def test_a_live_model_is_handed_out_once() -> None:
+def test_a_sensors_frame_does_not_wait_for_the_even_model_and_one_gets_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on, plain = threading.Event(), Even.of
+
+    def slow(*what: Any) -> Even:
+        go_on.wait(10)
+        return plain(*what)
+
+    monkeypatch.setattr(Even, "of", slow)
     with Pipeline(ACQUIRING, realtime=True) as pipeline:
-        assert pipeline.make(make_frame(0)).model is None
-        assert pipeline._pending is not None
-        made = pipeline._pending.result()
-        later = [pipeline.make(make_frame(index)).model for index in range(1, MODEL_EVERY)]
-    assert later == [made] + [None] * (MODEL_EVERY - 2)
+        models = [pipeline.make(make_frame(index)).model for index in range(EVEN_EVERY_LIVE + 1)]
+        assert all(model is not None and model.even is None for model in models)
+        go_on.set()
+        assert pipeline._even is not None
+        made = pipeline._even.result()
+        assert (later := pipeline.make(make_frame(9)).model) is not None
+    assert later.even is made
+
+
+@pytest.mark.parametrize(("asked", "frames"), [(None, [0]), (3, [0, 3, 6, 9]), (0, [])])
+def test_a_recordings_frames_have_the_even_model_as_often_as_asked(asked: int | None, frames: list[int]) -> None:
+    settings = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, even_every=asked))
+    with Pipeline(settings) as pipeline:
+        models = [pipeline.make(make_frame(index)).model for index in range(10)]
+    assert [index for index, model in enumerate(models) if model is not None and model.even is not None] == frames
+
+
+def test_the_even_model_is_that_of_as_many_measurements() -> None:
+    with Pipeline(ACQUIRING) as pipeline:
+        result = pipeline.make(make_frame(0))
+    assert result.model is not None and result.model.even is not None and result.acquisition is not None
+    uv = even_lattice(result.frame.shape, len(result.acquisition.uv))
+    even_mm = reconstruct(uv, result.frame.measure(uv), result.frame.shape)
+    np.testing.assert_array_equal(result.model.even.depth_mm, even_mm)
+    assert result.model.even.rmse_mm == pytest.approx(errors_of(even_mm, result.frame.depth_mm).rmse_mm)
+
+
+def test_options_changed_on_the_way_hold_from_the_next_frame_on() -> None:
+    with Pipeline(ACQUIRING) as pipeline:
+        pipeline.begin(make_frame(0))
+        more = AcquireOptions(budget=0.1, rounds=3, by="even")
+        pipeline.adopt(dataclasses.replace(ACQUIRING, acquire=more))
+        pipeline.begin(make_frame(1))
+        before, after = (result.acquisition for result in pipeline.rest())
+    assert before is not None and after is not None
+    assert (before.by, len(before.rounds)) == ("surface score", 2)
+    assert (after.by, len(after.rounds)) == ("even", 3)
+    assert sum(each.shots for each in after.rounds) > 1.9 * sum(each.shots for each in before.rounds)
+
+
+def test_what_the_governor_leaves_out_is_left_out() -> None:
+    asked = dataclasses.replace(SMALL, acquire=AcquireOptions(budget=0.05, rounds=4))
+    with Pipeline(asked) as pipeline:
+        pipeline.ease(Eased(model_every=2, rounds=2, gas_every=2))
+        results = [pipeline.make(make_frame(index)) for index in range(4)]
+    assert [result.model is None for result in results] == [False, True, False, True]
+    assert {len(result.acquisition.rounds) for result in results if result.acquisition} == {2}
+    assert results[1].regions is results[0].regions and results[2].regions is not results[1].regions
 
 
 def test_stage_loop_holds_what_the_loop_itself_did(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -256,7 +304,7 @@ def test_a_closed_loop_leaves_no_thread() -> None:
     with Pipeline(ACQUIRING, realtime=True) as pipeline:
         pipeline.make(make_frame(0))
     left = {thread.name for thread in set(threading.enumerate()) - before}
-    assert not [name for name in left if name.startswith(("beside", "model"))]
+    assert not [name for name in left if name.startswith(("beside", "even"))]
 
 
 @pytest.mark.parametrize(("budget", "realtime"), [(0.05, False), (0.05, True), (0.0, True)])

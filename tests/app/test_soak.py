@@ -18,8 +18,8 @@ from conftest import ROOT
 from rerun_listener import Listener
 from virtual_sensor import VirtualSensor
 
-from selective_depth.app.commands import run as session_module
-from selective_depth.app.commands.run import Session
+from selective_depth.app.commands import session as session_module
+from selective_depth.app.commands.session import Session
 from selective_depth.app.settings import AcquireOptions, RunOptions, Settings, ViewerOptions
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.oni import write_oni

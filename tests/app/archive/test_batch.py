@@ -20,7 +20,7 @@ from archives import QUICK, START, Archive, Done, batch, children, finish, kill,
 from selective_depth.app import cli
 from selective_depth.app.archive import Batch, Job
 from selective_depth.app.commands.batch import Keeping
-from selective_depth.app.commands.run import Session
+from selective_depth.app.commands.session import Session
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline import figures_of
 from selective_depth.app.settings import AcquireOptions, GasOptions, SeedOptions, Settings, ViewerOptions

@@ -1,0 +1,406 @@
+"""A run from its source to its report: where source, pipeline and viewer meet."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from selective_depth.app.archive.table import FigureTable, writing
+from selective_depth.app.archive.table import row_of as figure_row
+from selective_depth.app.commands.model import save_result
+from selective_depth.app.commands.snapshot import row_of
+from selective_depth.app.commands.steering import Recording, Status, Steering, changed, unused
+from selective_depth.app.console import interrupt
+from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
+from selective_depth.app.console.progress import FrameProgress, waiting
+from selective_depth.app.pictures import contact_sheet, write_picture
+from selective_depth.app.pipeline import (
+    Feed,
+    FrameResult,
+    Governor,
+    Pipeline,
+    RunReport,
+    SensorNote,
+    figures_of,
+    gain_of,
+    mean_of,
+    open_and_tell,
+    save_settings,
+    say,
+    state_of,
+)
+from selective_depth.app.settings import Settings
+from selective_depth.app.viewer import Viewer, join_command
+from selective_depth.drivers.errors import DeviceLostError, OutputError, SourceTimeoutError
+from selective_depth.drivers.frame import DepthFrame
+from selective_depth.drivers.open import open_source
+from selective_depth.drivers.played import PlayedSource
+from selective_depth.drivers.realtime import RealtimeSource
+from selective_depth.drivers.source import DepthSource
+from selective_depth.selectors.parallel import default_threads
+
+log = logging.getLogger(__name__)
+WAIT_S = 0.1
+"""How long nothing is looked at while a run is paused."""
+
+
+def beside(saved: Path) -> tuple[Path, Path]:
+    """Where the settings and the picture of a saved run go."""
+    return saved.with_suffix(".toml"), saved.with_suffix(".png")
+
+
+class Session:
+    """One run.
+
+    Parameters
+    ----------
+    uri : str
+        As for `open_source`.
+    settings : Settings
+        All options, checked.
+    steering : Steering, optional
+        What is asked of it on the way.
+
+    Attributes
+    ----------
+    settings : Settings
+        Those that hold now.
+    report : RunReport
+        What it has come to.
+    last : FrameResult or None
+        The last result.
+    prepare : callable
+        Called with pipeline and first frame before the second is read: `Pipeline.warm_up`, and whatever else
+        is to be ready then.
+    help : str
+        What is shown beside the progress.
+    """
+
+    def __init__(self, uri: str, settings: Settings, steering: Steering | None = None) -> None:
+        self.settings = settings
+        self.steering = steering or Steering()
+        self.report = RunReport(uri, live=False)
+        self.prepare: Callable[[Pipeline, DepthFrame], None] = Pipeline.warm_up
+        self.help = ""
+        self._uri = uri
+        self.last: FrameResult | None = None
+        self._code = OK
+        self._ready_s = 0.0
+        self._recent_s: deque[float] = deque(maxlen=31)
+        self._recent: deque[dict[str, float]] = deque(maxlen=30)
+        self._governor: Governor | None = None
+        self._recording: Recording | None = None
+        self._unfinished: list[threading.Thread] = []
+        self._went_by = 0  # frames that a sensor made while the run was paused
+
+    def run(self) -> int:
+        """Run to the end of the source, the asked number of frames, or Ctrl-C.
+
+        Returns
+        -------
+        int
+            Exit code, as for `watch`.
+        """
+        report, seen = self.report, self.settings.viewer
+        with ExitStack() as stack:
+            with waiting(f"Opening {self._uri}"):
+                source = stack.enter_context(self._open())
+            sensor = source.live
+            if (speed := self.settings.play.speed or float(self.settings.play.realtime)) and not sensor:
+                source = stack.enter_context(RealtimeSource(source, speed))
+            report.live = source.live
+            _tell(source)
+            report.troubles += source.notes
+            told = len(source.notes)
+            pipeline = stack.enter_context(Pipeline(self.settings, realtime=source.live))
+            if source.live and not self.settings.run.no_governor:
+                self._governor = Governor(self.settings.acquire, 1000 / source.fps)
+            limits = self.settings.run.frames, source.frame_count
+            frames = min((limit for limit in limits if limit is not None), default=None)  # None: nobody knows
+            table = None if seen.table is None else stack.enter_context(writing(seen.table, {"source": self._uri}))
+            viewer = self._open_viewer(pipeline, frames)
+            try:
+                with interrupt.recognised(), FrameProgress(self._uri, frames, self.help) as progress:
+                    self._flow(source, pipeline, viewer, progress, table)
+                if viewer.served_url and not sensor and not self.steering.stopped:
+                    say("All frames are served; Ctrl-C ends.")
+                    threading.Event().wait()
+            except KeyboardInterrupt:
+                self._code = INTERRUPTED
+            finally:
+                report.troubles += [*viewer.close(), *viewer.news()]
+                if viewer.file_failed and self._code == OK:
+                    self._code = FAILED
+                self._finish_recordings()
+                report.troubles += source.notes[told:]  # what came up on the way
+                report.missed = viewer.dropped
+                report.state = state_of(source)
+                report.dropped = source.dropped - report.dropped_starting - self._went_by
+                report.stages = pipeline.times.summary()
+                if self._governor is not None and self._governor.most.said:
+                    report.given_up = f"{self._governor.most.said}, in {self._governor.frames:,} frames"
+                self._publish(ended=True)
+            if table is not None:
+                table.finish("", {"source": self._uri})
+                report.written += [seen.table] if seen.table and table.rows else []
+            if viewer.options.save is not None and self.last is not None:
+                self._write_beside(viewer.options.save, self.last)
+            if seen.save_model is not None and self.last is not None:
+                report.written += save_result(seen.save_model, self.last)
+        return self._code
+
+    def _open(self) -> DepthSource:
+        """The source, played as it was asked for."""
+        source, play = open_and_tell(self._uri), self.settings.play
+        if source.live or (play.start, play.every, play.loop) == (0, 1, False):
+            return source
+        again = partial(open_source, self._uri) if play.loop else None
+        return PlayedSource(source, again, start=play.start, every=play.every)
+
+    def _open_viewer(self, pipeline: Pipeline, frames: int | None) -> Viewer:
+        """Open every place where the run is to be seen, and tell what came of it."""
+        spend = self.settings.acquire
+        viewer = Viewer(
+            self.settings.viewer,
+            live=self.report.live,
+            times=pipeline.times,
+            frames=frames,
+            title=f"{Path(self._uri).name} {f'by {spend.by}' if spend.budget else ''}",
+            fallback=Path("out", "live.rrd" if self._uri.startswith("openni") else "replay.rrd"),
+        )
+        self.settings = replace(self.settings, viewer=viewer.options)
+        for sentence in viewer.news():
+            say(sentence)
+        if viewer.served_url:
+            say(f"Serving; join with '{join_command(viewer.served_url)}'.")
+        return viewer
+
+    def _flow(
+        self,
+        source: DepthSource,
+        pipeline: Pipeline,
+        viewer: Viewer,
+        progress: FrameProgress,
+        table: FigureTable | None,
+    ) -> None:
+        """Source to pipeline to result to sinks, one frame after the other."""
+        feed = Feed(source, self.settings.run.frames)
+        state, taken, skipped = state_of(source), 0, 0
+
+        def tell(sentence: str) -> None:
+            progress.say(sentence)
+            self.steering.tell(sentence)
+
+        def hand_on(results: Iterable[FrameResult]) -> None:
+            for result in results:
+                self._show(result, source, pipeline, viewer)
+                if table is not None:
+                    table.add(figure_row(result))
+                progress.update(self.report.frames, f"{result.figures['fps']:.0f} frames/s")
+
+        self._publish(state=state)
+        for read in feed:
+            for sentence in viewer.news():
+                tell(sentence)
+            if self._recording is not None and self._recording.failure:
+                tell(f"Recording ended early: {self._recording.failure}.")
+                self._record(False, source, tell)
+            if read.state != state:
+                state = read.state
+                reason = getattr(source, "state_reason", "")
+                tell(f"sensor {state}{': ' if reason else ''}{reason}")
+                self._publish(state=f"{state}{': ' if reason else ''}{reason}")
+            if read.frame is None:
+                viewer.show(SensorNote(state))
+                hand_on(pipeline.rest())
+                self._obey(source, pipeline, tell)
+                continue
+            if taken == 0:
+                self._get_ready(read.frame, pipeline, viewer)
+                if self.settings.viewer.record is not None:
+                    self._record(True, source, tell)
+            elif taken == 1:
+                self.report.dropped_starting = skipped = source.dropped
+            taken += 1
+            if self._governor is not None and taken > 1:
+                if self._governor.note(source.dropped - skipped, read.read_ms):
+                    pipeline.ease(self._governor.eased)
+                    left_out = self._governor.eased.said
+                    tell(f"To keep up: {left_out}." if left_out else "Keeping up with all of it again.")
+                skipped = source.dropped
+            pipeline.begin(read.frame, state=state, read_ms=read.read_ms)
+            hand_on(pipeline.finished())
+            self._obey(source, pipeline, tell)
+            if self.steering.paused:
+                hand_on(pipeline.rest())
+                skipped += self._wait(source, pipeline, tell)
+            if self.steering.stopped:
+                break
+        if feed.damage is not None:
+            self.report.troubles.append(str(feed.damage))
+            self._code = FAILED
+        hand_on(pipeline.rest())
+
+    def _wait(self, source: DepthSource, pipeline: Pipeline, tell: Callable[[str], None]) -> int:
+        """Wait until the run goes on; what a sensor makes meanwhile goes by, uncounted. Returns how much that was."""
+        before = source.dropped
+        while self.steering.paused and not self.steering.stopped:
+            interrupt.check()
+            if source.live:
+                with suppress(SourceTimeoutError, DeviceLostError):
+                    source.read(WAIT_S)
+            else:
+                time.sleep(WAIT_S)
+            self._obey(source, pipeline, tell)
+        went_by = source.dropped - before
+        self._went_by += went_by
+        return went_by
+
+    def _obey(self, source: DepthSource, pipeline: Pipeline, tell: Callable[[str], None]) -> None:
+        """Do what was asked for since the last frame."""
+        wishes = self.steering.take()
+        for name, value in wishes:
+            if name == "paused":
+                self.steering.paused = value
+            elif name == "stop":
+                self.steering.stopped = True
+            elif name == "reset":
+                pipeline.forget()
+            elif name == "recording":
+                try:
+                    self._record(value, source, tell)
+                except OutputError as error:
+                    tell(str(error))
+            elif name == "snapshot":
+                self._take_picture(tell)
+            else:
+                self._change(changed(self.settings, name, value), pipeline)
+        if wishes:
+            self._publish()
+
+    def _change(self, settings: Settings, pipeline: Pipeline) -> None:
+        if settings.acquire != self.settings.acquire:
+            pipeline.adopt(settings)
+            self.report.begin_anew()
+            self._recent.clear()
+            if self._governor is not None:
+                self._governor.restart(settings.acquire)
+                pipeline.ease(self._governor.eased)
+        self.settings = settings
+
+    def _record(self, on: bool, source: DepthSource, tell: Callable[[str], None]) -> None:
+        """Begin to record, under the name that was given for the first time, or stop."""
+        if on and self._recording is None:
+            seen = self.settings.viewer
+            first = seen.record is not None and seen.record not in self.report.recorded
+            path = seen.record if first and seen.record is not None else unused("record", ".oni")
+            self._recording = Recording(source, path, seen.overwrite)
+            self.report.recorded[path] = (0, 0.0)
+            tell(f"Recording to {path}.")
+        elif not on and self._recording is not None:
+            recording, self._recording = self._recording, None
+
+            def done(sentence: str) -> None:
+                self.report.recorded[recording.path] = recording.frames, recording.seconds
+                tell(sentence)
+
+            self._unfinished.append(recording.stop_beside(done))
+
+    def _finish_recordings(self) -> None:
+        """Finish what is recorded to the last frame, however long that takes."""
+        if self._recording is not None:
+            self._record(False, self._recording.source, self.report.troubles.append)
+        for thread in self._unfinished:
+            thread.join()
+        self.report.written += [path for path, (frames, _) in self.report.recorded.items() if frames]
+
+    def _take_picture(self, tell: Callable[[str], None]) -> None:
+        """A sheet of the last frame, drawn beside the run."""
+        last = self.last
+        if last is None:
+            return
+        path, title = unused("picture", ".png"), self._title(last)
+
+        def draw() -> None:
+            write_picture(path, contact_sheet([row_of(last, title)]))
+            tell(f"Wrote {path}.")
+
+        self._unfinished.append(threading.Thread(target=draw, name="drawing a picture"))
+        self._unfinished[-1].start()
+
+    def _get_ready(self, frame: DepthFrame, pipeline: Pipeline, viewer: Viewer) -> None:
+        began_s = time.monotonic()
+        with waiting("Compiling for this machine; the next run starts at once"):
+            self.prepare(pipeline, frame)
+            viewer.wait_ready()
+        self._ready_s = time.monotonic()
+        self._recent_s.append(self._ready_s)
+        log.info("ready after %.1f s", self._ready_s - began_s)
+
+    def _show(self, result: FrameResult, source: DepthSource, pipeline: Pipeline, viewer: Viewer) -> None:
+        """Add what only the run knows of a result, and hand it to report and viewer."""
+        now_s = time.monotonic()
+        self._recent_s.append(now_s)
+        figures = figures_of(result)
+        self._recent.append(figures)
+        result.figures.update(
+            figures,
+            fps=(len(self._recent_s) - 1) / (now_s - self._recent_s[0]),
+            dropped_sensor=source.dropped - self._went_by,
+            dropped_viewer=sum(viewer.dropped.values()),
+        )
+        result.stages_ms.update(pipeline.times.last_ms() | result.stages_ms)
+        told = replace(
+            result,
+            gain=gain_of({name: mean_of(each[name] for each in self._recent) for name in figures}),
+            given_up="" if self._governor is None else self._governor.eased.said,
+            look=self.settings.viewer,
+        )
+        self.report.take(told)
+        self.report.seconds = now_s - self._ready_s
+        self.last = told
+        viewer.show(told)
+        self._publish(
+            state=told.state, gain=told.gain, given_up=told.given_up, fps=told.figures["fps"],
+            skipped=source.dropped - self.report.dropped_starting - self._went_by,
+        )  # fmt: skip
+
+    def _publish(self, **known: Any) -> None:
+        """Say how the run stands."""
+        settings, now = self.settings, self.steering.status or Status(self.settings.acquire, self.settings.viewer)
+        self.steering.status = replace(
+            now,
+            acquire=settings.acquire,
+            viewer=settings.viewer,
+            paused=self.steering.paused,
+            recording=self._recording is not None,
+            frames=self.report.frames,
+            news=self.steering.news,
+            **known,
+        )
+
+    def _title(self, last: FrameResult) -> str:
+        return f"{self._uri.rstrip('/').rpartition('/')[2]}, frame {last.frame.index}"
+
+    def _write_beside(self, saved: Path, last: FrameResult) -> None:
+        """Settings and a picture of the last frame."""
+        settings_file, picture_file = beside(saved)
+        save_settings(settings_file, self.settings, self._uri)
+        write_picture(picture_file, contact_sheet([row_of(last, self._title(last))]))
+        self.report.written += [saved, settings_file, picture_file]
+
+
+def _tell(source: DepthSource) -> None:
+    at, count = source.camera, "endless" if source.frame_count is None else source.frame_count
+    log.info(
+        f"{source.uri}: {count} frames, {at.width}x{at.height}, {source.fps:.4g} frames/s, fx {at.fx:.1f}"
+        f" fy {at.fy:.1f} cx {at.cx:.1f} cy {at.cy:.1f}; {default_threads()} kernel threads"
+    )

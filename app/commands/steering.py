@@ -1,0 +1,221 @@
+"""What people change while a run goes on, from whatever thread: asked for here, done between two frames."""
+
+from __future__ import annotations
+
+import math
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from selective_depth.app.console.errors import UsageError
+from selective_depth.app.pipeline.selecting import NAMES
+from selective_depth.app.settings import MOST_ROUNDS, AcquireOptions, Settings, ViewerOptions
+from selective_depth.drivers.oni import OniRecorder
+from selective_depth.drivers.source import DepthSource
+
+BUDGETS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
+"""Steps of the keys, as shares of the pixels."""
+LAYOUTS = ("engineer", "visitor")
+MEMORY_BUDGET = 0.02
+"""What a memory spends a frame where nothing was spent before."""
+FOLDER = Path("out")
+"""Where recordings and pictures go that are asked for without a name."""
+NEWS = 5
+"""How many of the last sentences are kept for people who look on."""
+
+_ALLOWED: dict[str, Callable[[Any], object]] = {
+    "budget": lambda x: 0 <= x <= 1,
+    "rounds": lambda x: 1 <= x <= MOST_ROUNDS and int(x) == x,
+    "by": lambda x: x in NAMES,
+    "memory": lambda x: x in ("off", "still"),
+    "layout": lambda x: x in LAYOUTS,
+    "detail": lambda x: isinstance(x, bool),
+    "paused": lambda x: isinstance(x, bool),
+    "recording": lambda x: isinstance(x, bool),
+    "snapshot": lambda x: x is None,
+    "reset": lambda x: x is None,
+    "stop": lambda x: x is None,
+}
+"""What may be asked for, and which values: no names of files, no code."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """How a run stands, for people who look on.
+
+    Attributes
+    ----------
+    acquire, viewer
+        The options that hold now.
+    paused, recording, ended : bool
+        Whether it waits, records, has ended.
+    frames, fps, skipped
+        So far, now, so far.
+    state : str
+        The source's, with the reason.
+    gain, given_up : str
+        As of `FrameResult`.
+    news : tuple of str
+        The last sentences.
+    """
+
+    acquire: AcquireOptions
+    viewer: ViewerOptions
+    paused: bool = False
+    recording: bool = False
+    ended: bool = False
+    frames: int = 0
+    fps: float = math.nan
+    skipped: int = 0
+    state: str = "starting"
+    gain: str = ""
+    given_up: str = ""
+    news: tuple[str, ...] = ()
+
+
+class Steering:
+    """Takes what is asked of a run, and holds what is known of it.
+
+    Attributes
+    ----------
+    paused : bool
+        Whether frames go by unprocessed.
+    stopped : bool
+        Whether the run is to end.
+    status : Status or None
+        How it stands; None before it has begun.
+    """
+
+    def __init__(self) -> None:
+        self.paused = self.stopped = False
+        self.status: Status | None = None
+        self._asked: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._news: deque[str] = deque(maxlen=NEWS)
+
+    def ask(self, name: str, value: Any = None) -> None:
+        """Ask for a change: see `Status` and ``_ALLOWED``.
+
+        Raises
+        ------
+        UsageError
+            If there is no such thing to change, or it cannot have that value.
+        """
+        allowed = _ALLOWED.get(name)
+        try:
+            good = allowed is not None and allowed(value)
+        except (TypeError, ValueError):
+            good = False
+        if not good:
+            raise UsageError(f"a run cannot be asked for {name!r:.40} {value!r:.40}.")
+        self._asked.put((name, value))
+
+    def press(self, key: str) -> None:
+        """Ask for what a key of the terminal stands for; see `console.keys.KEYS`."""
+        status = self.status
+        if status is None:
+            return
+        spend = status.acquire
+        wishes: dict[str, tuple[str, Any]] = {
+            " ": ("paused", not self.paused),
+            "+": ("budget", next((x for x in BUDGETS if x > spend.budget + 1e-9), BUDGETS[-1])),
+            "-": ("budget", next((x for x in BUDGETS[::-1] if x < spend.budget - 1e-9), 0.0)),
+            "]": ("rounds", min(spend.rounds + 1, 16)),
+            "[": ("rounds", max(spend.rounds - 1, 1)),
+            "s": ("by", NAMES[(NAMES.index(spend.by) + 1) % len(NAMES)] if spend.by in NAMES else NAMES[0]),
+            "m": ("memory", "off" if spend.memory == "still" else "still"),
+            "r": ("recording", not status.recording),
+            "p": ("snapshot", None),
+            "l": ("layout", LAYOUTS[(LAYOUTS.index(status.viewer.layout) + 1) % 2]),
+            "x": ("reset", None),
+            "q": ("stop", None),
+        }
+        if key in wishes:
+            self.ask(*wishes[key])
+
+    def take(self) -> list[tuple[str, Any]]:
+        """What was asked for since the last call."""
+        return [self._asked.get() for _ in range(self._asked.qsize())]
+
+    def tell(self, sentence: str) -> None:
+        """Keep a sentence for people who look on."""
+        self._news.append(sentence)
+
+    @property
+    def news(self) -> tuple[str, ...]:
+        """The last sentences."""
+        return tuple(self._news)
+
+
+def changed(settings: Settings, name: str, value: Any) -> Settings:
+    """Settings with one of the options that may be changed on the way."""
+    if name in ("layout", "detail"):
+        return replace(settings, viewer=replace(settings.viewer, **{name: value}))
+    spend = replace(settings.acquire, **{name: value})
+    if spend.memory == "still" and not spend.budget:  # a memory has to have something to spend, and something has
+        spend = replace(spend, memory="off") if name == "budget" else replace(spend, budget=MEMORY_BUDGET)
+    return replace(settings, acquire=spend)
+
+
+def unused(stem: str, ending: str) -> Path:
+    """A new name in `FOLDER`, which is made if need be, that says the time."""
+    FOLDER.mkdir(exist_ok=True)
+    return FOLDER / f"{stem}-{datetime.now():%Y%m%d-%H%M%S}{ending}"
+
+
+class Recording:
+    """Frames of a source on their way into an .oni file, for as long as this lives.
+
+    Parameters
+    ----------
+    source : DepthSource
+        What is recorded: every frame that it makes.
+    path : Path
+        The file.
+    overwrite : bool
+        Whether a file of that name is replaced.
+
+    Attributes
+    ----------
+    seconds : float
+        For how long was recorded; 0 until it has stopped.
+
+    Raises
+    ------
+    OutputError
+        If nothing can be written to that place, or there is something already.
+    """
+
+    def __init__(self, source: DepthSource, path: Path, overwrite: bool = False) -> None:
+        self.path, self.source = path, source
+        self.seconds = 0.0
+        self._began_s = time.monotonic()
+        self._recorder = OniRecorder(path, fps=source.fps, overwrite=overwrite)
+        source.tap = self._recorder.write
+
+    @property
+    def frames(self) -> int:
+        """How many are in the file."""
+        return self._recorder.frames
+
+    @property
+    def failure(self) -> str:
+        """What ended it early; empty if nothing did."""
+        return self._recorder.failure
+
+    def stop_beside(self, tell: Callable[[str], None]) -> threading.Thread:
+        """Take no more frames, and finish the file in a thread of its own; `tell` gets a sentence when that is done."""
+        self.source.tap = None
+        self.seconds = time.monotonic() - self._began_s
+
+        def finish() -> None:
+            tell(self._recorder.close() or f"Recorded {self.frames:,} frames to {self.path}.")
+
+        thread = threading.Thread(target=finish, name="finishing a recording")
+        thread.start()
+        return thread
