@@ -7,7 +7,7 @@ WINDOW_PACKAGES := libvulkan1 mesa-vulkan-drivers
 TEST_PACKAGES := libopenni2-0 libopenni2-dev g++ $(WINDOW_PACKAGES) xvfb x11-utils libfaketime
 
 .DEFAULT_GOAL := help
-.PHONY: help typing run test test-lowest test-slow fuzz lint format system-packages recordings pictures wheel wheel-check docs hooks clean
+.PHONY: help typing run test test-browser test-lowest test-slow fuzz lint format system-packages recordings pictures wheel wheel-check docs hooks clean
 
 help: ## Show this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -40,6 +40,11 @@ test-lowest: ## Run the suite's smoke part on the oldest versions that are allow
 	@.ci/lowest > .venv/lowest/constraints.txt
 	@.venv/lowest/bin/pip install --quiet --disable-pip-version-check --constraint .venv/lowest/constraints.txt '.[test]'
 	@NUMBA_CACHE_DIR=.venv/lowest/kernels .venv/lowest/bin/python -m pytest -m "$(QUICK)" $(SMOKE)
+
+test-browser: $(VENV)/.tests-installed ## Drive the demo page in a real Chromium; pictures go to out/browser
+	@.ci/system-packages chromium
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[browser]'
+	@$(BIN)/python -m pytest -m browser
 
 test-slow: $(VENV)/.tests-installed ## Run the long forms: fuzzing, soak, hundreds of cycles
 	@.ci/system-packages $(TEST_PACKAGES)

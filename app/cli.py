@@ -16,17 +16,20 @@ from selective_depth.app.console.command import PROGRAM, command
 from selective_depth.app.settings import (
     AcquireOptions,
     BatchOptions,
+    DemoOptions,
     Flag,
     Limit,
     LiveSettings,
     Natural,
     PictureOptions,
+    PlayOptions,
     Positive,
     SelectorOptions,
     Settings,
     Source,
     SourceOrSample,
     TimeLimit,
+    ViewerOptions,
     optional,
     whole,
 )
@@ -45,7 +48,7 @@ Acquiring = Annotated[AcquireOptions, arg(name="")]
 Page = Annotated[PictureOptions, arg(name="")]
 Selectors = Annotated[SelectorOptions, arg(name="")]
 DEFAULTS, LIVE, SELECTORS, PAGE, BATCH = Settings(), LiveSettings(), SelectorOptions(), PictureOptions(), BatchOptions()
-MODEL = AcquireOptions(budget=0.05, rounds=8)
+MODEL, SHOWN, DEMO = AcquireOptions(budget=0.05, rounds=8), AcquireOptions(budget=0.05, rounds=4), DemoOptions()
 SCENES = ("virtual:workstation", "virtual:ball", "virtual:firehose")
 
 
@@ -92,6 +95,40 @@ def live(device: Annotated[str, optional("DEVICE")] = "", /, settings: LiveOptio
     from selective_depth.app.commands.run import watch
 
     return watch(f"openni:{device}" if device else "openni", settings)
+
+
+@command(
+    "Watch",
+    (f"{PROGRAM} demo", "the sensor that is plugged in, else a bundled recording in a loop"),
+    (f"{PROGRAM} demo walk.oni --budget 2%", "a recording, in a loop"),
+    (f"{PROGRAM} demo --share", "for a tablet in the same room too"),
+)
+def demo(
+    source: SourceOrSample = None,
+    /,
+    options: Annotated[DemoOptions, arg(name="")] = DEMO,
+    selectors: Selectors = SELECTORS,
+    acquire: Acquiring = SHOWN,
+    play: Annotated[PlayOptions, arg(name="")] = DEFAULTS.play,
+) -> int:
+    """Show the viewer in a browser, with controls beside it, for people to watch and steer.
+
+    The page is on this machine only, unless --share is given. It needs an extra: pip install
+    'selective-depth[demo]'.
+
+    Parameters
+    ----------
+    source : str
+        As for replay or live; by default the sensor that is plugged in, else the sample in a loop.
+    options
+        Where the page is.
+    selectors, acquire, play
+        What it begins with.
+    """
+    from selective_depth.app.demo import run_demo
+
+    seen = ViewerOptions(layout="visitor")
+    return run_demo(source, options, Settings(**vars(selectors), acquire=acquire, play=play, viewer=seen))
 
 
 @command(

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from tyro.conf import Fixed, Suppress, arg
 from tyro.constructors import PrimitiveConstructorSpec
@@ -87,10 +87,11 @@ Millimetres = Annotated[int | None, whole(0, 65535), optional("MM")]
 
 
 SourceOrSample = Annotated[str | None, optional("SOURCE")]
-Hide = Annotated[
-    tuple[Literal["colour", "cloud", "nodes", "triangles", "samples"], ...],
-    arg(metavar="colour|cloud|nodes|triangles|samples..."),
-]
+Layout = Literal["engineer", "visitor"]
+Layer = Literal["colour", "cloud", "nodes", "triangles", "samples"]
+LAYOUTS: tuple[Layout, ...] = get_args(Layout)
+LAYERS: tuple[Layer, ...] = get_args(Layer)
+Hide = Annotated[tuple[Layer, ...], arg(metavar=f"{'|'.join(LAYERS)}...")]
 
 
 @dataclass(frozen=True)
@@ -213,6 +214,8 @@ class ViewerOptions:
     """Serve a stream that viewers can join; a replay is served until Ctrl-C."""
     serve_address: Annotated[str | None, optional("HOST:PORT")] = None
     """Where to serve it; by default on this machine only, at 9876 or the next free port."""
+    serve_origin: Annotated[str | None, optional("PATTERN")] = None
+    """Where web viewers that may join come from besides this machine, such as http://*:9090."""
     connect: Annotated[str | None, optional("URL")] = None
     """Send to a viewer that is already open, for example rerun+http://127.0.0.1:9876/proxy."""
     serve_memory: Memory = "256MiB"
@@ -223,12 +226,24 @@ class ViewerOptions:
     """Depth at the dark end of the colour scale; by default what suits the first frame."""
     far_mm: Millimetres = None
     """Depth at its bright end. Both hold for the whole run, so that colours never jump."""
-    layout: Literal["engineer", "visitor"] = "engineer"
+    layout: Layout = "engineer"
     """visitor: large pictures and what selecting gains; engineer: every figure of the run too."""
     hide: Hide = ()
     """Layers that are not shown."""
     detail: Flag = False
     """Show the kriging estimate, its variance and the long-edge triangles too."""
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """Where the page is."""
+
+    share: Flag = False
+    """Let others in this network use it too: whoever has the address that is printed."""
+    port: Annotated[int, whole(1, 65526)] = 8080
+    """The port it is on, or the next that is free."""
+    no_browser: Flag = False
+    """Open no browser."""
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ class RealtimeSource(DepthSource):
         self.fps = source.fps * speed
         self.frame_count = source.frame_count
         self.notes = source.notes
+        self.state = source.state
         self.dropped = 0
         self._changed = threading.Condition()
         self._newest: DepthFrame | None = None

@@ -146,7 +146,7 @@ class Session:
                 report.dropped = source.dropped - report.dropped_starting - self._went_by
                 report.stages = pipeline.times.summary()
                 if self._governor is not None and self._governor.most.said:
-                    report.given_up = f"{self._governor.most.said}, in {self._governor.frames:,} frames"
+                    report.given_up, report.given_up_frames = self._governor.most.said, self._governor.frames
                 self._publish(ended=True)
             if table is not None:
                 table.finish("", {"source": self._uri})
@@ -274,13 +274,11 @@ class Session:
                 self.steering.stopped = True
             elif name == "reset":
                 pipeline.forget()
-            elif name == "recording":
+            elif name in ("recording", "snapshot"):
                 try:
-                    self._record(value, source, tell)
+                    self._record(value, source, tell) if name == "recording" else self._take_picture(tell)
                 except OutputError as error:
                     tell(str(error))
-            elif name == "snapshot":
-                self._take_picture(tell)
             else:
                 self._change(changed(self.settings, name, value), pipeline)
         if wishes:

@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.output import make_folder
 from selective_depth.app.pipeline.selecting import NAMES
-from selective_depth.app.settings import MOST_ROUNDS, AcquireOptions, Settings, ViewerOptions
+from selective_depth.app.settings import LAYERS, LAYOUTS, MOST_ROUNDS, AcquireOptions, Settings, ViewerOptions
 from selective_depth.drivers.oni import OniRecorder
 from selective_depth.drivers.source import DepthSource
 
 BUDGETS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
 """Steps of the keys, as shares of the pixels."""
-LAYOUTS = ("engineer", "visitor")
 MEMORY_BUDGET = 0.02
 """What a memory spends a frame where nothing was spent before."""
 FOLDER = Path("out")
@@ -35,7 +35,7 @@ _ALLOWED: dict[str, Callable[[Any], object]] = {
     "by": lambda x: x in NAMES,
     "memory": lambda x: x in ("off", "still"),
     "layout": lambda x: x in LAYOUTS,
-    "detail": lambda x: isinstance(x, bool),
+    "hide": lambda x: set(x) <= set(LAYERS),
     "paused": lambda x: isinstance(x, bool),
     "recording": lambda x: isinstance(x, bool),
     "snapshot": lambda x: x is None,
@@ -154,7 +154,7 @@ class Steering:
 
 def changed(settings: Settings, name: str, value: Any) -> Settings:
     """Settings with one of the options that may be changed on the way."""
-    if name in ("layout", "detail"):
+    if name in ("layout", "hide"):
         return replace(settings, viewer=replace(settings.viewer, **{name: value}))
     spend = replace(settings.acquire, **{name: value})
     if spend.memory == "still" and not spend.budget:  # a memory has to have something to spend, and something has
@@ -163,8 +163,14 @@ def changed(settings: Settings, name: str, value: Any) -> Settings:
 
 
 def unused(stem: str, ending: str) -> Path:
-    """A new name in `FOLDER`, which is made if need be, that says the time."""
-    FOLDER.mkdir(exist_ok=True)
+    """A new name in `FOLDER`, which is made if need be, that says the time.
+
+    Raises
+    ------
+    OutputError
+        If there is no making it.
+    """
+    make_folder(FOLDER)
     return FOLDER / f"{stem}-{datetime.now():%Y%m%d-%H%M%S}{ending}"
 
 

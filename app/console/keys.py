@@ -11,10 +11,10 @@ from contextlib import contextmanager, suppress
 
 from selective_depth.app.console import interrupt
 
-KEYS = (
-    "+ - budget   [ ] rounds   s selector   m memory   space pause   r record   p picture   l layout   x reset   q quit"
-)
-"""What the keys do, in a line."""
+KEYS = """\
++ - budget   [ ] rounds   s selector   m memory   l layout   x reset   q quit
+space pause   r record   p picture"""
+"""What the keys do."""
 _LOOK_S = 0.2
 
 

@@ -78,7 +78,9 @@ class RunReport:
     recorded : dict of Path to (int, float)
         Files that were recorded on the way: frames, and for how many seconds.
     given_up : str
-        What the governor left out at most, and in how many frames; empty if it was nothing.
+        What the governor left out at most; empty if it was nothing.
+    given_up_frames : int
+        In how many frames.
     """
 
     source: str
@@ -92,6 +94,7 @@ class RunReport:
     state: str = ""
     by: str = ""
     given_up: str = ""
+    given_up_frames: int = 0
     means: dict[str, Mean] = field(default_factory=lambda: defaultdict(Mean))
     troubles: list[str] = field(default_factory=list)
     written: list[Path] = field(default_factory=list)
@@ -181,7 +184,7 @@ def print_report(report: RunReport) -> None:
     if report.changes:
         rows.append(("options changed", f"{report.changes:,}", "times; the figures are since the last"))
     if report.given_up:
-        rows.append(("left out to keep up", report.given_up, ""))
+        rows.append(("left out to keep up", f"{report.given_up_frames:,}", f"frames: {report.given_up}"))
     if means["known_percent"].count:
         rows.append(("pixels known", f"{means['known_percent'].value:.1f}%", "on average"))
     print_table(rows, justify="lrl")

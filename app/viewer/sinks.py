@@ -189,7 +189,7 @@ class ServedPlace(Place):
     def __init__(self, showing: Showing) -> None:
         self.host, self.port = _place_to_serve(showing.options.serve_address)
         super().__init__(f"stream served on {self.host}:{self.port}", showing)
-        host = _own_address() if self.host == "0.0.0.0" else self.host
+        host = own_address() if self.host == "0.0.0.0" else self.host
         self.url = f"rerun+http://{host}:{self.port}/proxy"
 
     def _connect(self) -> Recording:
@@ -357,7 +357,7 @@ def _place_to_serve(address: str | None) -> tuple[str, int]:
     )
 
 
-def _own_address() -> str:
+def own_address() -> str:
     """This machine's address in its network, as others can reach it; nothing is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way_out:
         try:

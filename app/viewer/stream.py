@@ -83,7 +83,8 @@ class Recording:
     @classmethod
     def to_server(cls, host: str, port: int, application: str, options: ViewerOptions) -> Self:
         """Serve viewers that join."""
-        sink = rr.GrpcServerSink(host, port, server_memory_limit=options.serve_memory)
+        origins = [options.serve_origin] if options.serve_origin else None
+        sink = rr.GrpcServerSink(host, port, server_memory_limit=options.serve_memory, cors_allow_origin=origins)
         return cls(sink, application, options)
 
     def log(self, item: FrameResult | SensorNote) -> None:

@@ -102,7 +102,11 @@ class VirtualSource(DepthSource):
         depth_mm, truth_mm, colour = self._render(index, noise=self._noise != "off", coloured=self._colouring.wanted)
         time_us = round(index * 1e6 / FPS)
         frame = DepthFrame(depth_mm, index, time_us, self.camera, self.uri, truth_mm=truth_mm)
-        return frame if colour is None else self._colouring.colour(frame, colour, time_us, True)
+        if colour is not None:
+            frame = self._colouring.colour(frame, colour, time_us, True)
+        if self.live and self.tap is not None:
+            self.tap(frame)
+        return frame
 
     def depth_at(self, index: int, *, noise: bool) -> DepthArray:
         """Depth of frame `index`, exact or as a Kinect reports it, whatever was read so far.

@@ -1,0 +1,105 @@
+"""`demo`: a run that is seen and steered in a browser."""
+
+from __future__ import annotations
+
+import importlib.util
+import secrets
+import webbrowser
+from dataclasses import replace
+
+from selective_depth.app.commands.samples import bundled_recording
+from selective_depth.app.commands.session import Session
+from selective_depth.app.commands.steering import Steering
+from selective_depth.app.console.errors import UsageError
+from selective_depth.app.console.keys import KEYS, pressed
+from selective_depth.app.console.progress import waiting
+from selective_depth.app.pipeline import Pipeline, print_report, say
+from selective_depth.app.settings import DemoOptions, Settings
+from selective_depth.app.viewer import own_address, serving_web_viewer, stream_port
+from selective_depth.drivers.errors import SourceError
+from selective_depth.drivers.frame import DepthFrame
+
+EVERYONE, ITSELF = "0.0.0.0", "127.0.0.1"
+
+
+def run_demo(source: str | None, options: DemoOptions, settings: Settings) -> int:
+    """Run a source, steered from a page in a browser, until Ctrl-C or the page's button.
+
+    Parameters
+    ----------
+    source : str or None
+        As for `open_source`; by default a sensor that is plugged in, else the bundled recording in a loop.
+    options : DemoOptions
+        Where the page is.
+    settings : Settings
+        What the run begins with.
+
+    Returns
+    -------
+    int
+        Exit code, as for `watch`.
+
+    Raises
+    ------
+    UsageError
+        If what the page is made with is not installed.
+    ViewerError
+        If the viewer for browsers or the page does not start.
+    """
+    if importlib.util.find_spec("nicegui") is None:
+        raise UsageError(
+            "'demo' needs NiceGUI for its page, which is not installed: pip install 'selective-depth[demo]'."
+        )
+    from selective_depth.app.demo.page import serving_page  # imports half a second of it
+
+    uri = source or _default_source()
+    host = EVERYONE if options.share else ITSELF
+    stream, token = stream_port(host), secrets.token_urlsafe(12) if options.share else ""
+    play = replace(settings.play, loop=True, realtime=True)
+    steering = Steering()
+    with serving_web_viewer(host, stream) as viewer_port:
+        seen = replace(
+            settings.viewer,
+            headless=True,
+            serve=True,
+            serve_address=f"{host}:{stream}",
+            serve_origin=f"http://*:{viewer_port}",
+        )
+        session = Session(uri, replace(settings, viewer=seen, play=play), steering)
+        session.prepare = _prepare
+        with serving_page(steering, uri, host, options.port, (viewer_port, stream), token) as port:
+            address = f"http://{own_address() if options.share else ITSELF}:{port}/{f'?token={token}' * bool(token)}"
+            say(f"The page is at {address} ; Ctrl-C ends.")
+            if options.share:
+                say(
+                    f"Open in this network: the page on port {port}, to those who have its address with the token;"
+                    f" the viewer on port {viewer_port} and the stream it shows on port {stream}, to everyone."
+                )
+            if not options.no_browser and not options.share:
+                webbrowser.open(address)
+            with pressed(steering.press) as keys:
+                session.help = KEYS if keys else ""
+                code = session.run()
+    print_report(session.report)
+    return code
+
+
+def _prepare(pipeline: Pipeline, frame: DepthFrame) -> None:
+    """Compile all that can be switched to, so that switching costs no frame."""
+    pipeline.warm_up(frame)
+    pipeline.warm_up_all(frame)
+    pipeline.warm_up(frame)
+
+
+def _default_source() -> str:
+    """The sensor that is plugged in, or what comes with the program."""
+    from selective_depth.drivers.openni import list_devices
+
+    try:
+        with waiting("Asking OpenNI2 for its sensors"):
+            if list_devices():
+                return "openni"
+    except SourceError as error:
+        say(f"No sensor: {error}")
+    say("The bundled recording is shown, in a loop.")
+    return bundled_recording()
