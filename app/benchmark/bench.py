@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from selective_depth.app.benchmark.loads import Load, run_loads
 from selective_depth.app.benchmark.peers import peer_seconds
 from selective_depth.app.commands.session import Session
 from selective_depth.app.console.errors import UsageError
@@ -50,6 +51,7 @@ class BenchReport:
     machine: dict[str, str]
     stages: dict[str, StageSummary]
     peers: dict[str, float]
+    loads: dict[str, Load]
 
     def to_json(self) -> str:
         """The report as JSON: milliseconds per stage, seconds per peer."""
@@ -117,6 +119,7 @@ def bench(source: str, frames: int | None = None, *, peers: bool = True, say: Sa
     _time_neural_gas(seeds, durations, say)
     say("the whole loop in real time, both selectors, saving for Rerun")
     report = _whole_loop(source, frames)
+    loads = run_loads(source, frames, say)
     say("peers" if peers else "done")
     measured = {name: summarise(each) for name, each in durations.items()}
     measured |= {"log": report.stages["log"], "loop": report.stages["loop"]}
@@ -129,6 +132,7 @@ def bench(source: str, frames: int | None = None, *, peers: bool = True, say: Sa
         machine=machine(),
         stages=measured,
         peers=peer_seconds(seeds[0], NODES, EPOCHS) if peers else {},
+        loads=loads,
     )
 
 

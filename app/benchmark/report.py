@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from selective_depth.app.benchmark.bench import BenchReport, bench, ratios
+from selective_depth.app.benchmark.loads import Spread
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.output import check_output, write_output
 from selective_depth.app.pipeline import say
@@ -15,19 +16,6 @@ PAGE = """# Benchmark
 
 Made by `selective-depth bench {report.source} --page benchmark.md`; every figure is of one run.
 {host}.
-
-The whole loop, both selectors with the live neural gas, saving for Rerun, on {report.source}
-played in real time: **{report.fps:.1f} frames/s over {report.frames} frames, {report.dropped}
-dropped**, {report.threads} kernel threads.
-
-| stage | p50 ms | p99 ms | max ms | runs |
-|---|---:|---:|---:|---:|
-{stages}
-
-`improvement` is the whole map with estimate and variance, holes and borders included;
-`neural_gas_exact` and `neural_gas_fast` train 2,800 nodes from nothing (exact: 50 epochs of
-eq. (1)-(4)); `neural_gas_live` goes on from the last frame; `regions` is Delaunay and both masks;
-`log` is what the viewer's thread spends on a frame beside the loop; `loop` is the whole turn.
 
 The same work in other libraries, timed in the same run:
 
@@ -39,6 +27,27 @@ The same work in other libraries, timed in the same run:
 of the first frame from its 16 nearest seeds, estimate and variance only; PyKrige's time is extended
 from two samples of the pixels. `numpy_neural_gas` is a plain NumPy loop of eq. (1)-(4), extended
 from 3,000 steps to 50 epochs.
+
+Whole runs, medians of three and their spread, nothing left out (`--no-governor`): `demo` is {report.source} in
+real time in a loop, both selectors, 5 % more in 4 rounds, a model of every frame and the even lattice's of every
+third, saved; `replay_saved` and `replay` the same without the even lattice, as fast as they go:
+
+| load | frames/s | dropped | loop p99 ms | log p99 ms | processor ms a frame |
+|---|---:|---:|---:|---:|---:|
+{loads}
+
+The whole loop without a budget, both selectors with the live neural gas, saving for Rerun, on {report.source}
+played in real time: **{report.fps:.1f} frames/s over {report.frames} frames, {report.dropped}
+dropped**, {report.threads} kernel threads.
+
+| stage | p50 ms | p99 ms | max ms | runs |
+|---|---:|---:|---:|---:|
+{stages}
+
+`improvement` is the whole map with estimate and variance, holes and borders included;
+`neural_gas_exact` and `neural_gas_fast` train 2,800 nodes from nothing (exact: 50 epochs of
+eq. (1)-(4)); `neural_gas_live` goes on from the last frame; `regions` is Delaunay and both masks;
+`log` is what the viewer's thread spends on a frame beside the loop; `loop` is the whole turn.
 
 How exact the timed code is: the map against eq. (13) in float64 in
 [improvement.md](improvement.md), the trainings against a plain float64 loop and against each
@@ -65,16 +74,30 @@ def run_bench(source: str, frames: int | None, *, json: Path | None, page: Path 
 
 
 def print_bench(report: BenchReport) -> None:
-    """Print stages, peers and ratios as tables."""
+    """Print ratios to the peers first, then whole runs, then stages, as tables."""
+    if report.peers:
+        others = [(f"{peer} / {stage}", f"{more} times", took) for peer, took, stage, more in _peer_rows(report)]
+        print_table(others, ("the same work elsewhere", "", "seconds"))
+    heads = ("whole runs, median (least-most)", "frames/s", "dropped", "loop p99 ms", "log p99 ms", "processor ms")
+    print_table(_load_rows(report), heads)
     Console(highlight=False).print(
         f"\n{report.source}: {report.frames} frames in real time at {report.fps:.1f} frames/s,"
         f" {report.dropped} dropped, {report.threads} threads",
         soft_wrap=True,
     )
     print_table(_stage_rows(report), ("milliseconds", "p50", "p99", "max", "runs"))
-    if report.peers:
-        others = [(f"{peer} / {stage}", took, f"{more} times") for peer, took, stage, more in _peer_rows(report)]
-        print_table(others, ("the same work elsewhere", "seconds", ""))
+
+
+def _load_rows(report: BenchReport) -> list[tuple[str, ...]]:
+    """A load's name and its figures, each with its spread, as text."""
+
+    def told(each: Spread) -> str:
+        return f"{each.median:.1f} ({each.least:.1f}-{each.most:.1f})"
+
+    return [
+        (name, *map(told, (load.fps, load.dropped, load.loop_p99_ms, load.log_p99_ms, load.cpu_ms)))
+        for name, load in report.loads.items()
+    ]
 
 
 def _stage_rows(report: BenchReport) -> list[tuple[str, ...]]:
@@ -98,5 +121,6 @@ def to_page(report: BenchReport) -> str:
     """The benchmark page of the documentation, in Markdown."""
     stages = "\n".join(f"| `{name}` | {' | '.join(figures)} |" for name, *figures in _stage_rows(report))
     peers = "\n".join(f"| `{peer}` | {took} s | `{stage}` | {more} |" for peer, took, stage, more in _peer_rows(report))
+    loads = "\n".join(f"| `{name}` | {' | '.join(figures)} |" for name, *figures in _load_rows(report))
     host = ", ".join(f"{name} {value}" for name, value in report.machine.items())
-    return PAGE.format(report=report, stages=stages, peers=peers, host=host)
+    return PAGE.format(report=report, stages=stages, peers=peers, loads=loads, host=host)

@@ -93,7 +93,7 @@ class Session:
         self._uri = uri
         self.last: FrameResult | None = None
         self._code = OK
-        self._ready_s = 0.0
+        self._ready_s = self._ready_cpu_s = 0.0
         self._recent_s: deque[float] = deque(maxlen=31)
         self._recent: deque[dict[str, float]] = deque(maxlen=30)
         self._governor: Governor | None = None
@@ -339,7 +339,7 @@ class Session:
         with waiting("Compiling for this machine; the next run starts at once"):
             self.prepare(pipeline, frame)
             viewer.wait_ready()
-        self._ready_s = time.monotonic()
+        self._ready_s, self._ready_cpu_s = time.monotonic(), time.process_time()
         self._recent_s.append(self._ready_s)
         log.info("ready after %.1f s", self._ready_s - began_s)
 
@@ -364,6 +364,7 @@ class Session:
         )
         self.report.take(told)
         self.report.seconds = now_s - self._ready_s
+        self.report.processor_s = time.process_time() - self._ready_cpu_s
         self.last = told
         viewer.show(told)
         self._publish(

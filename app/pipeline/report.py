@@ -63,6 +63,8 @@ class RunReport:
         What was run.
     live : bool
         Whether frames could be lost.
+    processor_s : float
+        Processor time of all threads while frames were made.
     dropped_starting : int
         Frames lost while everything was got ready with the first one.
     dropped : int
@@ -87,6 +89,7 @@ class RunReport:
     live: bool
     frames: int = 0
     seconds: float = 0.0
+    processor_s: float = 0.0
     dropped_starting: int = 0
     dropped: int = 0
     missed: dict[str, int] = field(default_factory=dict)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selective_depth.app.benchmark import bench, peers
+from selective_depth.app.benchmark import bench, loads, peers
 from selective_depth.app.benchmark import report as bench_report
 from selective_depth.app.console.errors import UsageError
 from selective_depth.selectors.neural_gas import train_exact
@@ -21,6 +21,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "NODES", 200)
     monkeypatch.setattr(bench, "EPOCHS", 1)
     monkeypatch.setattr(peers, "NUMPY_STEPS", 50)
+    monkeypatch.setattr(loads, "RUNS", 1)
     # The kriging libraries take seconds each and are timed by the benchmark itself.
     monkeypatch.setattr(peers, "find_spec", lambda name: None)
 
@@ -46,7 +47,14 @@ def test_figures_have_the_documented_shape(small: None, tmp_path: Path) -> None:
     assert report["threads"] >= 1 and report["fps"] > 0
     assert set(report["peers"]) == {"numpy_neural_gas"}
     assert "numpy_neural_gas / neural_gas_exact" in report["ratios"]
-    assert "`improvement`" in page.read_text()
+    assert set(report["loads"]) == {"demo", "replay_saved", "replay"}
+    for load in report["loads"].values():
+        assert 0 < load["fps"]["least"] <= load["fps"]["median"] <= load["fps"]["most"]
+        assert load["stages_ms"]["acquire"] > 0 and load["cpu_ms"]["median"] > 0
+    assert report["loads"]["replay"]["log_p99_ms"]["most"] == 0
+    text = page.read_text()
+    assert "`improvement`" in text
+    assert text.index("numpy_neural_gas") < text.index("`replay_saved`") < text.index("| stage |")  # ratios first
 
 
 def test_a_source_without_end_is_not_read_into_memory_for_ever() -> None:
@@ -57,7 +65,7 @@ def test_a_source_without_end_is_not_read_into_memory_for_ever() -> None:
 def test_ratios_are_peer_over_stage() -> None:
     summary = bench.summarise([2.0, 4.0, 6.0])
     assert (summary.p50_ms, summary.max_ms, summary.count) == (4.0, 6.0, 3)
-    report = bench.BenchReport("x", 1, 0, 1.0, 1, {}, {"improvement": summary}, {"krigekit_ordinary_kriging": 2.0})
+    report = bench.BenchReport("x", 1, 0, 1.0, 1, {}, {"improvement": summary}, {"krigekit_ordinary_kriging": 2.0}, {})
     assert bench.ratios(report) == {"krigekit_ordinary_kriging / improvement": 500.0}
 
 
