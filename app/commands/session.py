@@ -223,11 +223,14 @@ class Session:
                 hand_on(pipeline.rest())
                 self._obey(source, pipeline, tell)
                 continue
-            if taken == 0:
+            if not self._ready_s:
                 self._get_ready(read.frame, pipeline, viewer)
                 if self.settings.viewer.record is not None:
-                    self._record(True, source, tell)
-            elif taken == 1:
+                    self._record(True, source, tell, read.frame)
+            if not taken and self._recording is not None and not self._recording.has(read.frame):
+                feed.frames = None if feed.frames is None else feed.frames + 1  # what is shown is recorded
+                continue
+            if taken == 1:
                 self.report.dropped_starting = skipped = source.dropped
             taken += 1
             if self._governor is not None and taken > 1:
@@ -294,13 +297,20 @@ class Session:
                 pipeline.ease(self._governor.eased)
         self.settings = settings
 
-    def _record(self, on: bool, source: DepthSource, tell: Callable[[str], None]) -> None:
-        """Begin to record, under the name that was given for the first time, or stop."""
+    def _record(
+        self, on: bool, source: DepthSource, tell: Callable[[str], None], first: DepthFrame | None = None
+    ) -> None:
+        """Begin to record, under the name that was given for the first time, or stop.
+
+        A recording's frame that was read already is `first`; a sensor's is too old by now.
+        """
         if on and self._recording is None:
             seen = self.settings.viewer
-            first = seen.record is not None and seen.record not in self.report.recorded
-            path = seen.record if first and seen.record is not None else unused("record", ".oni")
+            named = seen.record if seen.record not in self.report.recorded else None
+            path = named or unused("record", ".oni")
             self._recording = Recording(source, path, seen.overwrite)
+            if first is not None and not source.live:
+                self._recording.take(first)
             self.report.recorded[path] = (0, 0.0)
             tell(f"Recording to {path}.")
         elif not on and self._recording is not None:

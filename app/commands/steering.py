@@ -17,6 +17,7 @@ from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.output import make_folder
 from selective_depth.app.pipeline.selecting import NAMES
 from selective_depth.app.settings import LAYERS, LAYOUTS, MOST_ROUNDS, AcquireOptions, Settings, ViewerOptions
+from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni import OniRecorder
 from selective_depth.drivers.source import DepthSource
 
@@ -202,7 +203,18 @@ class Recording:
         self.seconds = 0.0
         self._began_s = time.monotonic()
         self._recorder = OniRecorder(path, fps=source.fps, overwrite=overwrite)
-        source.tap = self._recorder.write
+        self._began_us: int | None = None
+        source.tap = self.take
+
+    def take(self, frame: DepthFrame) -> None:
+        """Put a frame in."""
+        if self._began_us is None:
+            self._began_us = frame.timestamp_us
+        self._recorder.write(frame)
+
+    def has(self, frame: DepthFrame) -> bool:
+        """Whether a frame of the source is in it: those before it began are not."""
+        return self._began_us is not None and frame.timestamp_us >= self._began_us
 
     @property
     def frames(self) -> int:

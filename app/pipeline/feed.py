@@ -54,6 +54,8 @@ class Feed:
 
     Attributes
     ----------
+    frames : int or None
+        At most so many; may be changed on the way.
     damage : DamagedRecordingError or None
         What ended it before the end of the recording.
     """
@@ -61,11 +63,11 @@ class Feed:
     def __init__(self, source: DepthSource, frames: int | None = None) -> None:
         self.damage: DamagedRecordingError | None = None
         self._source = source
-        self._frames = frames
+        self.frames = frames
 
     def __iter__(self) -> Iterator[Read]:
         source, taken = self._source, 0
-        while taken != self._frames:
+        while taken != self.frames:
             interrupt.check()
             start_s = time.perf_counter()
             frame = None

@@ -32,6 +32,7 @@ from selective_depth.app.pipeline import save_settings
 from selective_depth.app.settings import MOST_ROUNDS, GasOptions, PlayOptions, RunOptions, Settings, ViewerOptions
 from selective_depth.app.viewer import sinks as places
 from selective_depth.drivers.errors import OutputError
+from selective_depth.drivers.open import open_source
 
 pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 ROOT = Path(__file__).parents[2]
@@ -645,6 +646,40 @@ def test_live_sensor_from_the_command_line(
     assert written is not None
     assert int(written[1]) >= 10
     assert cli.run(["replay", str(recording), *QUICK]) == 0
+
+
+def test_a_replay_is_recorded_from_its_first_frame_to_its_last(tmp_path: Path) -> None:
+    out = tmp_path / "b.oni"
+    assert cli.run(["replay", ENDLESS, *QUICK, "--frames", "7", "--start", "3", "--record", str(out)]) == 0
+    with open_source(out) as recorded, open_source(ENDLESS) as made:
+        made.skip(3)
+        for frame in recorded:
+            np.testing.assert_array_equal(frame.depth_mm, made.read().depth_mm)
+        assert frame.index == 6
+
+
+@pytest.mark.openni
+def test_a_live_run_records_every_frame_of_the_sensor_bit_by_bit(
+    virtual_driver: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those that the run skipped too: the numbers in the frames' corners leave none out."""
+    seen_mm = np.random.default_rng(1).integers(500, 4000, (97, 120, 160), dtype=np.uint16)
+    seen_mm[:, 0, 0] = 1000 + np.arange(97)
+    for name, value in VirtualSensor(tmp_path / "sensor", seen_mm).env.items():
+        monkeypatch.setenv(name, value)
+    walk = tmp_path / "walk.oni"
+    arguments = ["live", *QUICK, "--budget", "5%", "--frames", "60", "--record", str(walk)]
+    assert cli.run([*arguments, "--save", str(tmp_path / "walk.rrd")]) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"walk\.oni \(\d+ frames, [\d.,]+ MB, [\d,]+ MB a minute\)", shown), shown
+    assert re.search(r"walk\.rrd \([\d.,]+ MB, [\d,]+ MB a minute\)", shown), shown
+    with open_source(walk) as source:
+        frames = list(source)
+    assert len(frames) >= 60
+    numbers = [int(frame.depth_mm[0, 0]) - 1000 for frame in frames]
+    assert [number % 97 for number in range(numbers[0], numbers[0] + len(numbers))] == numbers
+    for number, frame in zip(numbers, frames, strict=True):
+        np.testing.assert_array_equal(frame.depth_mm, seen_mm[number])
 
 
 @pytest.mark.slow
