@@ -135,6 +135,13 @@ class _MendingCache(FunctionCache):
             source_stamp=self._impl.locator.get_source_stamp(),
         )
 
+        _CACHES.append(self)
+
+    @property
+    def filled(self) -> bool:
+        """Whether anything is in it, whole or not."""
+        return Path(self._cache_file._index_path).exists()
+
     def load_overload(self, sig: object, target_context: object) -> Any:
         try:
             return super().load_overload(sig, target_context)
@@ -149,6 +156,14 @@ class _MendingCache(FunctionCache):
             super().save_overload(sig, data)
         except Exception as error:  # noqa: BLE001 - an index that could not be flushed, a full disk
             _say_once(f"Compiled kernels cannot be kept in '{self.cache_path}': {error}.")
+
+
+_CACHES: list[_MendingCache] = []
+
+
+def kept_share() -> float:
+    """Share of the kernels declared so far that some earlier run has compiled and kept."""
+    return sum(cache.filled for cache in _CACHES) / len(_CACHES) if _CACHES else 1.0
 
 
 @functools.cache

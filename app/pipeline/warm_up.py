@@ -15,12 +15,15 @@ from contextlib import contextmanager
 import numpy as np
 
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.kernels import kept_share
 from selective_depth.selectors.acquire import acquire
 from selective_depth.selectors.neural_gas import NeuralGasSelector
 from selective_depth.selectors.seeds import SeedGrid
 
 PATIENCE_S = 2.0
 """Kernels that are in the cache are ready sooner than this."""
+MOST_KEPT = 0.25
+"""Where less of the kernels is in the cache this is the first run, and help is needed at once."""
 
 
 @contextmanager
@@ -33,7 +36,7 @@ def compiling_beside() -> Iterator[None]:
         quiet = subprocess.DEVNULL
         started.append(subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet))
 
-    timer = threading.Timer(PATIENCE_S, start)
+    timer = threading.Timer(PATIENCE_S if kept_share() > MOST_KEPT else 0.0, start)
     timer.daemon = True
     timer.start()
     try:

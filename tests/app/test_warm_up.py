@@ -31,6 +31,16 @@ def test_it_is_waited_for_and_does_its_work(started: list[subprocess.Popen[bytes
     assert [process.returncode for process in started] == [0]
 
 
+def test_a_first_run_does_not_wait_for_help(
+    started: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(precompile, "PATIENCE_S", 60.0)
+    monkeypatch.setattr(precompile, "kept_share", lambda: 0.0)
+    with precompile.compiling_beside():
+        time.sleep(0.2)
+    assert len(started) == 1
+
+
 def test_nothing_is_left_after_an_error(started: list[subprocess.Popen[bytes]]) -> None:
     with pytest.raises(KeyboardInterrupt), precompile.compiling_beside():
         time.sleep(0.2)
@@ -41,6 +51,7 @@ def test_nothing_is_left_after_an_error(started: list[subprocess.Popen[bytes]]) 
 
 def test_warm_kernels_need_no_help(started: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(precompile, "PATIENCE_S", 60.0)
+    monkeypatch.setattr(precompile, "kept_share", lambda: 1.0)
     with precompile.compiling_beside():
         pass
     assert started == []

@@ -216,3 +216,20 @@ def test_nothing_writable_is_said_once_and_the_library_works(tmp_path: Path) -> 
     assert (done.returncode, done.stdout) == (0, "5\n"), done.stderr
     assert done.stderr.count("\n") == 1
     assert "Compiled kernels cannot be kept here" in done.stderr
+
+
+def test_the_share_of_kernels_that_are_kept_tells_a_first_run(tmp_path: Path) -> None:
+    """By processes with a cache folder of their own: empty at first, then with what the first has compiled."""
+    script = (
+        "from selective_depth.drivers import kernels\n"
+        "from selective_depth.selectors import choice, samples\n"
+        "print(kernels.kept_share())\n"
+        "import numpy as np\n"
+        "choice.choose(np.ones((40, 40), np.float32), 3)\n"
+        "print(kernels.kept_share())\n"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment
+    ).stdout.split()
+    assert float(done[0]) == 0 < float(done[1])
