@@ -289,10 +289,12 @@ def best_threshold(raw, histogram, wanted):  # type: ignore[no-untyped-def]
     edge[0] = (level + 1) << LEVEL_SHIFT
     if level == 0 or above == wanted:
         return edge.view(np.float32)[0]
+    # Within the level by the lower bits, of which all values have a count: to sort them, as fast,
+    # takes seconds to compile.
+    lower = np.zeros(1 << LEVEL_SHIFT, np.int32)
+    below = np.uint32(len(lower) - 1)
     bits = raw.view(np.uint32)
     level_bits = np.uint32(level)
-    group = np.empty(histogram[level], np.int32)
-    count = 0
     for start in range(0, len(bits), BLOCK):
         block = bits[start : start + BLOCK]
         # Most blocks hold none, and vector instructions find that out.
@@ -303,11 +305,10 @@ def best_threshold(raw, histogram, wanted):  # type: ignore[no-untyped-def]
             continue
         for n in range(len(block)):
             if block[n] >> LEVEL_SHIFT == level_bits:
-                group[count] = block[n]
-                count += 1
-    group.sort()
-    place = count - (wanted - above)
-    edge[0] = group[place]
-    if group[place - 1] == group[place]:
-        edge[0] += 1
+                lower[block[n] & below] += ONE
+    at = len(lower) - 1
+    while above + lower[at] <= wanted:
+        above += lower[at]
+        at -= 1
+    edge[0] = (level << LEVEL_SHIFT) + at + 1
     return edge.view(np.float32)[0]
