@@ -102,7 +102,7 @@ def test_a_write_that_fails_leaves_what_was_written_before(tmp_path: Path) -> No
     saved = tmp_path / "out.rrd"
     command = [sys.executable, "-m", "selective_depth.app", "replay", ENDLESS, "--save", str(saved)]
     done = subprocess.run(
-        ["sh", "-c", 'ulimit -f 8192; exec "$@"', "sh", *command, *QUICK],  # blocks of 512 bytes
+        ["sh", "-c", 'ulimit -f 40960; exec "$@"', "sh", *command, *QUICK],  # blocks of 512 bytes
         capture_output=True,
         text=True,
         timeout=60,

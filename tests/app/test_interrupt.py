@@ -40,7 +40,7 @@ def test_a_run_interrupted_in_a_compiled_function_ends_as_any_other(
         fail()
 
     monkeypatch.setattr(interrupt, "_asked", asked)
-    monkeypatch.setattr(Pipeline, "_regions", interrupted)
+    monkeypatch.setattr(Pipeline, "_gas_of", interrupted)
     arguments = ["replay", "virtual:ball?size=64x48&frames=9", "--headless"]
     assert cli.run([*arguments, "--seeds.rows", "16", "--seeds.columns", "16"]) == 130
     shown = capsys.readouterr()
