@@ -30,6 +30,8 @@ from selective_depth.app.settings import (
     SourceOrSample,
     TimeLimit,
     ViewerOptions,
+    WindowSize,
+    not_negative,
     optional,
     whole,
 )
@@ -288,12 +290,20 @@ def model(
     return model_frame(source, out, frame, settings)
 
 
-@command("Pictures", (f"{PROGRAM} screenshot out.rrd out.png", "the viewer on a recording that --save wrote"))
+@command(
+    "Pictures",
+    (f"{PROGRAM} screenshot out.rrd out.png", "the viewer on a recording that --save wrote"),
+    (f"{PROGRAM} screenshot out.rrd out.png --time 12.5 --size 1280x720", "after so many seconds"),
+    (f"{PROGRAM} screenshot out.rrd space.png --view 'In space'", "one view alone"),
+)
 def screenshot(
     recording: Annotated[Path, arg(metavar="FILE.rrd")],
     picture: Annotated[Path, arg(metavar="FILE.png")],
     /,
     frame: Annotated[int | None, whole(0), optional("N")] = None,
+    time: Annotated[float | None, not_negative, optional("SECONDS")] = None,
+    view: Annotated[str | None, optional("NAME")] = None,
+    size: WindowSize = (1920, 1080),
 ) -> int:
     """Take a picture of the viewer without a display; it needs a graphics driver.
 
@@ -302,13 +312,19 @@ def screenshot(
     recording : Path
         A Rerun recording, as --save writes it.
     picture : Path
-        The picture to make, .png or .webp, 1920x1080.
+        The picture to make, .png or .webp.
     frame : int
         The frame to show; by default the last.
+    time : float
+        Show the time so many seconds after the first frame instead.
+    view : str
+        Show one view alone: its title, or the beginning of it.
+    size : tuple of int
+        Width and height of the viewer in pixels.
     """
     from selective_depth.app.commands.snapshot import take_screenshot
 
-    return take_screenshot(recording, picture, frame)
+    return take_screenshot(recording, picture, frame, time, view, size)
 
 
 @command(

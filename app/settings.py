@@ -80,6 +80,19 @@ Shares = Annotated[tuple[float, ...], must_be(*_A_SHARE, several=True), arg(meta
 positive = must_be("more than 0", float, lambda x: 0 < x < float("inf"))
 Positive = Annotated[float, positive]
 TimeLimit = Annotated[float | None, positive, optional("SECONDS")]
+not_negative = must_be("0 or more", float, lambda x: 0 <= x < float("inf"))
+
+
+def _window(typed: str) -> tuple[int, int]:
+    width, height = map(int, typed.split("x"))
+    return width, height
+
+
+WindowSize = Annotated[
+    tuple[int, int],
+    must_be("WIDTHxHEIGHT, each from 200 to 8,000 pixels", _window, lambda wh: all(200 <= n <= 8000 for n in wh)),
+    arg(metavar="WxH", help_behavior_hint="(default: 1920x1080)"),
+]
 _SIZE = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%")
 Memory = Annotated[str, must_be("a size, such as 256MiB or 25%", str, _SIZE.fullmatch), arg(metavar="SIZE")]
 Scheduler = Annotated[str | None, optional("ADDRESS|FILE")]

@@ -114,23 +114,27 @@ def draw_snapshot(sources: Sequence[str], number: int, out: Path, settings: Sett
     return OK
 
 
-def take_screenshot(recording: Path, picture: Path, frame: int | None) -> int:
-    """Take a picture of the viewer showing a frame, by default the last; returns the exit code.
+def take_screenshot(
+    recording: Path, picture: Path, frame: int | None, time_s: float | None, view: str | None, size: tuple[int, int]
+) -> int:
+    """Take a picture of the viewer, by default showing the last frame; returns the exit code.
 
     Raises
     ------
     UsageError
-        If the picture is of a format that cannot be made, or the file is not a Rerun recording.
+        If the picture is of a format that cannot be made, or there is no such frame, time or view.
     ViewerError
-        If the viewer does not run here.
+        If the file is no Rerun recording, or the viewer does not run here.
     OutputError
         If the picture cannot be written.
     """
     from selective_depth.app import viewer
 
     check_picture(picture, IMAGES)
+    if frame is not None and time_s is not None:
+        raise UsageError("--frame and --time both say what to show; give one of them.")
     with waiting("Loading it into the viewer"):
-        taken = viewer.screenshot(recording, frame)
+        taken = viewer.screenshot(recording, frame, time_s=time_s, view=view, size=size)
     write_image(picture, taken)
     say(f"wrote {picture}")
     return OK

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import socket
-import tempfile
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,19 +14,29 @@ import numpy.typing as npt
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError, ViewerError
-from selective_depth.app.viewer.window import viewer_executable
+from selective_depth.app.settings import ViewerOptions
+from selective_depth.app.viewer.window import local_url, start
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
 
 _MAGIC = b"RRF2"
+BIRTH_S = 20.0
+"""How long a viewer may take to start."""
 LOAD_S = 5.0
 """How long a viewer may show nothing while it is loading nothing."""
 PAINT_S = 30.0
 """How long it may take to paint what it has loaded."""
 
 
-def screenshot(recording: Path, frame: int | None = None) -> npt.NDArray[np.uint8]:
+def screenshot(
+    recording: Path,
+    frame: int | None = None,
+    *,
+    time_s: float | None = None,
+    view: str | None = None,
+    size: tuple[int, int] = (1920, 1080),
+) -> npt.NDArray[np.uint8]:
     """Show a recording in an invisible viewer and take its picture.
 
     Parameters
@@ -36,17 +44,23 @@ def screenshot(recording: Path, frame: int | None = None) -> npt.NDArray[np.uint
     recording : Path
         An .rrd that `--save` wrote.
     frame : int, optional
-        Frame to show; default the last.
+        Frame to show; by default the last.
+    time_s : float, optional
+        Instead of a frame: seconds since the first one.
+    view : str, optional
+        Title of the one view to show, or the beginning of it; by default all of them.
+    size : tuple of int, default (1920, 1080)
+        Width and height of the window; one view alone is a little smaller.
 
     Returns
     -------
-    uint8 array of shape (1080, 1920, 3)
-        The window, blue-green-red.
+    uint8 array of shape (height, width, 3)
+        The window or the view, blue-green-red.
 
     Raises
     ------
     UsageError
-        If the recording has no such frame.
+        If the recording has no such frame, time or view.
     ViewerError
         If there is no such recording, or the viewer does not run here; it needs a graphics driver
         (Mesa's lavapipe will do).
@@ -62,28 +76,26 @@ def screenshot(recording: Path, frame: int | None = None) -> npt.NDArray[np.uint
         raise ViewerError(
             f"'{recording}' is no Rerun recording; 'selective-depth replay SOURCE --save FILE.rrd' makes one."
         )
-    # The viewer complains on the terminal where there is none, as on a server.
-    os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = int(free.getsockname()[1])
     with ExitStack() as stack:
         try:
             with interrupt.deferred():
-                client = ViewerClient.spawn(
-                    headless=True, port=port, hide_welcome_screen=True, executable_path=viewer_executable()
-                )
-                stack.callback(client.quit)
-        except RuntimeError as error:
-            raise ViewerError(
-                f"the viewer does not start ({str(error).splitlines()[0]}). Install a graphics"
-                " driver: apt-get install mesa-vulkan-drivers libvulkan1."
-            ) from None
-        _load(client, recording, frame)
-        return _settled_picture(client)
+                process, _ = start(
+                    port, ViewerOptions(viewer_memory="75%"), "--headless", "--window-size", f"{size[0]}x{size[1]}",
+                    patience_s=BIRTH_S,
+                )  # fmt: skip
+                stack.callback(process.wait)
+                stack.callback(process.kill)
+        except ViewerError as error:
+            raise ViewerError(f"{error} A graphics driver: apt-get install mesa-vulkan-drivers libvulkan1.") from None
+        client = ViewerClient.connect(local_url(port))
+        _load(client, recording, frame, time_s)
+        return _settled_picture(client, None if view is None else _maximised(client, view))
 
 
-def _load(client: ViewerClient, recording: Path, frame: int | None) -> None:
-    """Open a recording in a viewer and wait until all of it is there, at a frame if asked."""
+def _load(client: ViewerClient, recording: Path, frame: int | None, time_s: float | None) -> None:
+    """Open a recording in a viewer and wait until all of it is there, at a frame or time if asked."""
     client.open(str(recording.resolve()))
     deadline_s = time.monotonic() + LOAD_S
     while True:
@@ -96,24 +108,43 @@ def _load(client: ViewerClient, recording: Path, frame: int | None) -> None:
         elif time.monotonic() > deadline_s:
             raise ViewerError(f"the viewer finds nothing to show in '{recording}'.")
         time.sleep(0.1)
-    if frame is None:
-        return
     spans = {each.name: (each.start, each.end) for each in shown[0].timelines}
-    first, last = spans.get("frame", (None, None))
-    if first is None or last is None:
-        raise UsageError(f"--frame is {frame}, but '{recording}' has no frames, only other times.")
-    if not first <= frame <= last:
-        raise UsageError(f"--frame is {frame}; the frames of '{recording}' are {first}..{last}.")
-    client.set_time("frame", sequence=frame, play_state="paused")  # else it plays on to the end
+    for timeline, asked, unit in (("frame", frame, 1), ("time", time_s, 1e9)):
+        if asked is None:
+            continue
+        first, last = spans.get(timeline, (None, None))
+        if first is None or last is None:
+            raise UsageError(f"--{timeline} is {asked:g}, but '{recording}' has no {timeline}s.")
+        if not first <= asked * unit <= last:
+            ends = f"{first / unit:g}..{last / unit:g}"
+            raise UsageError(f"--{timeline} is {asked:g}; the {timeline}s of '{recording}' are {ends}.")
+        if timeline == "frame":  # paused: else it plays on to the end
+            client.set_time(timeline, sequence=int(asked), play_state="paused")
+        else:
+            client.set_time(timeline, duration=asked, play_state="paused")
 
 
-def _settled_picture(client: ViewerClient) -> npt.NDArray[np.uint8]:
-    """The viewer's window, once it does not change any more: it tells nobody when it is done."""
+def _maximised(client: ViewerClient, title: str) -> str:
+    """Let one view have the whole window; returns its id."""
+    views = sorted(client.get_state().views, key=lambda each: each.name)
+    views = [each for each in views if each.view_class != "2D" or not each.name.endswith(": lines")]
+    for like in (str.__eq__, str.startswith):
+        found = [each.view_id for each in views if like(each.name.lower(), title.lower())]
+        if found:
+            shown = client.get_blueprint("recording")
+            shown.blueprint["/viewport"]["ViewportBlueprint"]["maximized"] = found[0]
+            client.set_blueprint(shown.blueprint, of="recording")
+            return found[0]
+    raise UsageError(f"--view is '{title}'; there are: {', '.join(each.name for each in views)}.")
+
+
+def _settled_picture(client: ViewerClient, view: str | None) -> npt.NDArray[np.uint8]:
+    """The viewer's window, or a view, once it does not change any more: it tells nobody when it is done."""
     deadline_s = time.monotonic() + PAINT_S
-    before, now = b"", client.take_screenshot()
+    before, now = b"", client.take_screenshot(view)
     while now != before and time.monotonic() < deadline_s:
         time.sleep(0.5)
-        before, now = now, client.take_screenshot()
+        before, now = now, client.take_screenshot(view)
     taken = cv2.imdecode(np.frombuffer(now, np.uint8), cv2.IMREAD_COLOR)
     if taken is None:
         raise ViewerError("the viewer made no picture. Look at the recording with 'rerun' instead.")

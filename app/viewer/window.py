@@ -172,7 +172,7 @@ def get_window(options: ViewerOptions, taken: Container[int] = ()) -> Window:
         port = next((port for port, it in there.items() if it is None), None)
         if port is None:
             break
-        awake = _start(port, options)
+        awake = start(port, options)[1]
         if awake is not None:
             notes = tuple(
                 f"Port {other} has {it.name}; the viewer window listens on {port}."
@@ -200,8 +200,10 @@ def look_at(port: int) -> Listener | None:
     return replace(listener, fits=ours and listener.silent)
 
 
-def _start(port: int, options: ViewerOptions) -> bool | None:
-    """Start a viewer and watch its birth.
+def start(
+    port: int, options: ViewerOptions, *more: str, patience_s: float = BIRTH_S
+) -> tuple[subprocess.Popen[bytes], bool | None]:
+    """Start a viewer, with `more` arguments, and watch its birth.
 
     False if it lives but has not answered in time, None if another program had the port first.
 
@@ -218,7 +220,7 @@ def _start(port: int, options: ViewerOptions) -> bool | None:
     command = [executable, "--bind", "127.0.0.1", "--port", str(port)]
     command += ["--memory-limit", options.viewer_memory]
     command += ["--server-memory-limit", options.serve_memory]
-    command += ["--hide-welcome-screen", "--expect-data-soon"]
+    command += ["--hide-welcome-screen", "--expect-data-soon", *more]
     # The file has no name and goes with the viewer; only what ends that is written to it.
     with tempfile.TemporaryFile() as complaints:
         try:
@@ -234,16 +236,16 @@ def _start(port: int, options: ViewerOptions) -> bool | None:
         except OSError as error:
             raise ViewerError(f"the viewer window does not start: '{executable}': {error.strerror}.") from None
         try:
-            return _is_born(process, port, complaints)
+            return process, _is_born(process, port, complaints, patience_s)
         except BaseException:
             process.kill()
             process.wait()
             raise
 
 
-def _is_born(process: subprocess.Popen[bytes], port: int, complaints: IO[bytes]) -> bool | None:
-    """Wait until a viewer answers; False and None as for `_start`."""
-    deadline_s = time.monotonic() + BIRTH_S
+def _is_born(process: subprocess.Popen[bytes], port: int, complaints: IO[bytes], patience_s: float) -> bool | None:
+    """Wait until a viewer answers; False and None as for `start`."""
+    deadline_s = time.monotonic() + patience_s
     while (left_s := deadline_s - time.monotonic()) > 0:
         if process.poll() is not None:
             if process.returncode == 0 or listens(("127.0.0.1", port)):
@@ -256,7 +258,7 @@ def _is_born(process: subprocess.Popen[bytes], port: int, complaints: IO[bytes])
         time.sleep(_LEAST_GAP_S)
     if listens(("127.0.0.1", port)):
         return False
-    raise ViewerError(f"the viewer window does not start: it does not answer within {BIRTH_S:g} s.")
+    raise ViewerError(f"the viewer window does not start: it does not answer within {patience_s:g} s.")
 
 
 def _reason(process: subprocess.Popen[bytes], complaints: IO[bytes]) -> str:
