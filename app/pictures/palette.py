@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -12,44 +13,83 @@ import numpy.typing as npt
 
 Image = npt.NDArray[np.uint8]
 """Picture, shape (height, width, 3), red-green-blue."""
-Colourmap = Literal["viridis", "inferno", "plasma"]
-"""Called so in Rerun and OpenCV alike."""
+Colourmap = Literal["viridis", "inferno", "plasma", "ice"]
+"""The first three are called so in Rerun and OpenCV alike."""
+_ICE = ((10, 14, 40), (26, 48, 122), (52, 122, 208), (150, 212, 242), (255, 255, 255))
 
 
 @dataclass(frozen=True)
 class Scale:
-    """A quantity that is shown by colours, linearly from dark to bright.
+    """A quantity that is shown by colours, from dark to bright.
 
     Parameters
     ----------
     quantity : str
         What it is of.
     colormap : str
-        Name of the colour map.
+        Name of the colour map, which no other quantity has.
     limits : tuple of float
         Values at the dark and at the bright end; what lies beyond has the colour of the end.
     unit : str
         Of the limits; empty for a pure number.
+    root : bool, default False
+        Whether colours follow the square root of the value instead of the value.
+    between : tuple of float, optional
+        Values between the limits that a colour bar names too.
+    steps : int, default 0
+        How many colours there are, where they are few.
     """
 
     quantity: str
     colormap: Colourmap
     limits: tuple[float, float]
     unit: str = ""
+    root: bool = False
+    between: tuple[float, ...] = ()
+    steps: int = 0
 
-    def colour(self, values: npt.NDArray[np.generic]) -> Image:
-        """Colours of values of any shape, red-green-blue in one axis more; NaN is the dark end."""
+    @property
+    def bar(self) -> Image:
+        """Colours of a colour bar, shape (n, 3), dark end first."""
+        return channels(round_colours(self.steps)[1:] if self.steps else palette(self.colormap))
+
+    @property
+    def ticks(self) -> list[tuple[float, str]]:
+        """What a colour bar names: place from 0, the dark end, to 1, and text; the last has the unit."""
+        values = (self.limits[0], *self.between, self.limits[1])
+        texts = [f"{value:g}" for value in values]
+        texts[-1] += f" {self.unit}" if self.unit else ""
+        return list(zip(self.place(values).tolist(), texts, strict=True))
+
+    def place(self, values: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """Where values of any shape lie between the limits, 0..1 as colours go; NaN at 0."""
         low, high = self.limits
-        level = np.clip(np.rint((np.nan_to_num(values, nan=low) - low) * (255 / (high - low))), 0, 255)
-        return np.asarray(channels(palette(self.colormap))[level.astype(np.uint8)])
+        share = np.asarray((np.asarray(values, np.float32) - np.float32(low)) * np.float32(1 / (high - low)))
+        np.fmin(np.fmax(share, np.float32(0), out=share), np.float32(1), out=share)
+        return np.asarray(np.sqrt(share, out=share) if self.root else share)
+
+    def told(self, place: float) -> str:
+        """The value at a place between the limits, 0..1 as colours go, with its unit."""
+        low, high = self.limits
+        return f"{low + (high - low) * (place**2 if self.root else place):.1f} {self.unit}"
+
+    def colour(self, values: npt.ArrayLike) -> Image:
+        """Colours of values of any shape, red-green-blue in one axis more; NaN is the dark end."""
+        return np.asarray(channels(palette(self.colormap))[np.rint(255 * self.place(values)).astype(np.uint8)])
 
 
 IMPROVEMENT = Scale("improvement", "inferno", (0.0, 1.0))
-ERROR = Scale("model error", "inferno", (0.0, 100.0), "mm")
-"""Of the model as of the kriging deviation; larger errors share the brightest colour."""
-DEPTH_COLOURMAP: Colourmap = "viridis"
+ERROR = Scale("error", "ice", (0.0, 100.0), "mm", root=True, between=(5.0, 25.0))
+"""Of models as of the kriging deviation, in the viewer, in stills and in evaluations alike.
+
+A good model is off by the sensor's noise, 1 to 5 mm, nearly everywhere and by hundreds at a few
+steps. On a linear scale it is black, and so is all that tells it from a better one; by the square
+root the noise has the lowest fifth of the colours, and what is off by more is told apart up to 100.
+"""
+AGE = Scale("known, frames ago", "plasma", (25.0, 0.0))
+DEPTH_COLOURMAP: Literal["viridis"] = "viridis"
 ROUND_COLOURMAP: Colourmap = "plasma"
-AGE_COLOURMAP: Colourmap = "inferno"
+"""When something was measured: in which round, or how many frames ago; the latest is bright."""
 
 HOLE = 0x6F7480FF
 REGION = 0x26A69AA8
@@ -62,7 +102,9 @@ UNKNOWN = "no measurement near"
 """What `HOLE` means."""
 
 BACKGROUND = (13, 13, 13)
-_ROW = 46
+_FACE = cv2.FontFace("sans")
+_ROW, _COLUMN, _BAR = 66, 690, 280
+"""Pixels of the viewer's legend: height of a row, width of a column and of a colour bar."""
 
 STATE_COLOURS = {
     "live": 0x26A69AFF,
@@ -73,32 +115,16 @@ STATE_COLOURS = {
 }
 """Each state that a sensor can be in."""
 
-HOW_TO_READ = """\
-From left to right: measured → wanted → acquired → known.
-
-- **Scene** – what a colour camera sees, where there is one.
-- **1 Sensor** – every pixel of the frame.
-- **2 Seeds** – the lattice that is measured first: all that the selectors know.
-- **3a Neural gas** – nodes settle on surfaces; triangles whose edges are short are the regions \
-it selects.
-- **3b Improvement** – where one more measurement would help.
-- **4 Acquired** – what was measured besides, round by round.
-- **4 Known** – with a memory: all that is known, bright where just measured; red where forgotten.
-- **5 Error** – the dense model made of all samples, against the sensor's frame.
-- **In space** – cloud, camera, nodes with their triangles, new samples.
-"""
-
 FIGURES = {
     "fps": ("frames/s", 0x009E73FF),
-    "dropped_sensor": ("dropped by sensor", 0xE69F00FF),
-    "dropped_viewer": ("dropped by viewer", 0xCC79A7FF),
-    "samples": ("samples", 0x56B4E9FF),
-    "quantisation_error_mm": ("quantisation error", 0x26A69AFF),
-    "rmse_mm": ("model to the frame", 0xE69F00FF),
-    "truth_rmse_mm": ("model to the truth", 0x56B4E9FF),
-    "sensor_rmse_mm": ("frame to the truth", 0xCC79A7FF),
+    "dropped_sensor": ("by the sensor", 0xE69F00FF),
+    "dropped_viewer": ("by the viewer", 0xCC79A7FF),
+    "quantisation_error_mm": ("nodes", 0x26A69AFF),
+    "rmse_mm": ("selective", 0xE69F00FF),
+    "truth_rmse_mm": ("  to truth", 0x56B4E9FF),
+    "sensor_rmse_mm": ("whole frame", 0xCC79A7FF),
     "even_rmse_mm": ("even lattice", 0x999999FF),
-    "measured_percent": ("measured in this frame", 0x56B4E9FF),
+    "measured_percent": ("this frame", 0x56B4E9FF),
     "known_percent": ("known in all", 0x26A69AFF),
 }
 """Running figures of a frame: how a plot calls and colours them."""
@@ -118,6 +144,11 @@ def depth_limits_mm(depth_mm: npt.NDArray[np.uint16]) -> tuple[int, int]:
     return near, max(int(-(-high // 500)) * 500, near + 500)
 
 
+def round_scale(rounds: int) -> Scale:
+    """The scale of the rounds in which something was measured, from 1."""
+    return Scale("measured in round", ROUND_COLOURMAP, (1, rounds), steps=rounds)
+
+
 def depth_scale(limits_mm: tuple[float, float]) -> Scale:
     """The scale of depth in metres: near is dark, far is bright."""
     near_mm, far_mm = limits_mm
@@ -133,10 +164,15 @@ def backdrop_limits_mm(limits_mm: tuple[float, float]) -> tuple[float, float]:
 @cache
 def palette(colormap: Colourmap) -> npt.NDArray[np.uint32]:
     """The 256 colours of a colour map, packed as 0xRRGGBBAA."""
-    number = getattr(cv2, f"COLORMAP_{colormap.upper()}")
     levels = np.arange(256, dtype=np.uint8).reshape(-1, 1)
-    bgr = np.asarray(cv2.applyColorMap(levels, number))[:, 0].astype(np.uint32)
-    packed = bgr @ np.array([1 << 8, 1 << 16, 1 << 24], dtype=np.uint32) + np.uint32(255)
+    if colormap == "ice":
+        at = np.linspace(0, 255, len(_ICE))
+        made: npt.NDArray[np.generic] = np.stack(
+            [np.interp(levels[:, 0], at, part).round() for part in zip(*_ICE, strict=True)][::-1], axis=1
+        )
+    else:
+        made = np.asarray(cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{colormap.upper()}")))[:, 0]
+    packed = made.astype(np.uint32) @ np.array([1 << 8, 1 << 16, 1 << 24], dtype=np.uint32) + np.uint32(255)
     return np.asarray(packed, dtype=np.uint32)
 
 
@@ -154,49 +190,65 @@ def channels(packed: npt.NDArray[np.uint32] | int) -> Image:
     return (np.asarray(packed, np.uint32)[..., None] >> shift).astype(np.uint8)
 
 
-def picture(limits_mm: tuple[float, float], rounds: int) -> Image:
-    """Draw the legend of the viewer: every colour scale with its ends, every single colour.
+Swatch = tuple[str, int]
+"""What a single colour means, and the colour."""
+
+
+def picture(scales: Sequence[Scale], swatches: Sequence[Swatch], columns: int = 1) -> Image:
+    """Draw a legend: every colour scale with its ticks, every single colour.
 
     OpenCV draws it: the first frame waits for it, and matplotlib alone takes half a second to
     import.
 
     Parameters
     ----------
-    limits_mm : tuple of float
-        Depth at the two ends of the depth scale.
-    rounds : int
-        Rounds of acquisition; 0 leaves samples and error out.
+    scales : sequence of Scale
+        The scales.
+    swatches : sequence of (str, int)
+        The single colours.
+    columns : int, default 1
+        In how many columns.
 
     Returns
     -------
     uint8 array of shape (height, width, 3)
         Red-green-blue, on the viewer's own background.
     """
-    near, far = (f"{limit / 1000:.1f} m" for limit in limits_mm)
-    ramps = [("depth", palette(DEPTH_COLOURMAP), near, far)]
-    ramps.append((IMPROVEMENT.quantity, palette(IMPROVEMENT.colormap), "none", "most"))
-    if rounds:
-        last = f"round {rounds}" if rounds > 1 else ""
-        ramps.append(("acquired in", round_colours(rounds)[1:], "round 1", last))
-        limit = f"{ERROR.limits[1]:.0f} {ERROR.unit}"
-        ramps.append((ERROR.quantity, palette(ERROR.colormap), "0", limit))
-    swatches = [(UNKNOWN, HOLE), ("kept triangles: the regions selected", REGION | 0xFF), ("neural-gas nodes", NODE)]
-    image = np.full((_ROW * (len(ramps) + len(swatches)) + 20, 760, 3), BACKGROUND, np.uint8)
-    for row, (name, ramp, low, high) in enumerate(ramps):
-        base = _ROW * row + 44
-        _write(image, name, 20, base)
-        end = _write(image, low, 220, base)
-        colours = channels(ramp[np.arange(240) * len(ramp) // 240])
-        image[base - 22 : base + 4, max(end, 320) + 16 : max(end, 320) + 256] = colours
-        _write(image, high, max(end, 320) + 272, base)
-    for row, (name, colour) in enumerate(swatches):
-        base = _ROW * (len(ramps) + row) + 44
-        image[base - 22 : base + 4, 20:64] = channels(colour)
-        _write(image, name, 84, base)
+    rows = -(-(len(scales) + len(swatches)) // columns)
+    image = np.full((_ROW * rows, _COLUMN * columns, 3), BACKGROUND, np.uint8)
+    entries: list[Scale | Swatch] = [*scales, *swatches]
+    for number, entry in enumerate(entries):
+        left, base = _COLUMN * (number % columns) + 16, _ROW * (number // columns) + 36
+        if not isinstance(entry, Scale):
+            image[base - 22 : base + 4, left : left + 40] = channels(entry[1])
+            _write(image, entry[0], left + 54, base)
+            continue
+        _write(image, entry.quantity, left, base)
+        bar, start = entry.bar, left + 280
+        image[base - 22 : base + 4, start : start + _BAR] = bar[np.arange(_BAR) * len(bar) // _BAR]
+        for at, text in entry.ticks:
+            _write(image, text, start + round(at * _BAR) - 6, base + 28, 22)
     return image
 
 
-def _write(image: Image, text: str, left: int, base: int) -> int:
-    face = cv2.FontFace("sans")
-    (end, _), _ = cv2.putText(image, text, (left, base), (225, 225, 225), face, 28, 400)
+def key(lines: Sequence[Swatch]) -> Image:
+    """Draw what the lines of a plot are, to stand beside it, where it covers none of them."""
+    width = max(cv2.getTextSize((0, 0), text, (0, 0), _FACE, 24, 400)[2] for text, _ in lines) + 40
+    image = np.full((34 * len(lines), width, 3), BACKGROUND, np.uint8)
+    for row, (text, colour) in enumerate(lines):
+        image[34 * row + 14 : 34 * row + 20, :24] = channels(colour)
+        _write(image, text, 32, 34 * row + 25, 24)
+    return image
+
+
+def headline(text: str) -> Image:
+    """Draw a line large, to be read from afar; always of one size, as the viewer wants an entity's images to be."""
+    image = np.full((72, 1720, 3), BACKGROUND, np.uint8)
+    width = cv2.getTextSize((0, 0), text, (0, 0), _FACE, 44, 500)[2]
+    _write(image, text, max((1720 - width) // 2, 0), 52, 44, 500)
+    return image
+
+
+def _write(image: Image, text: str, left: int, base: int, size: int = 28, weight: int = 400) -> int:
+    (end, _), _ = cv2.putText(image, text, (left, base), (225, 225, 225), _FACE, size, weight)
     return int(end)

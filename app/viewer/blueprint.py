@@ -2,85 +2,262 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import rerun as rr
 import rerun.blueprint as rrb
 
 from selective_depth.app.pictures import palette as legend
 
+Part = rrb.Container | rrb.View
 
-def blueprint(
-    *,
-    by: str | None,
-    detail: bool,
-    memory: bool = False,
-    colour: bool = False,
-    coloured_cloud: bool = False,
-    look_at_m: float = 2.0,
-    limits_mm: tuple[float, float] = (500.0, 5000.0),
-) -> rrb.Blueprint:
-    """Layout of the viewer, left to right in the order of the method.
+TITLES = {
+    "scene": ("Scene", "what a colour camera sees"),
+    "sensor": ("1 Sensor", "every pixel of the frame"),
+    "seeds": ("2 Seeds", "the lattice that is measured first: all that the selectors know"),
+    "gas": ("3a Neural gas", "nodes settle on surfaces; triangles whose edges are short are the regions it selects"),
+    "score": ("3b Improvement", "where one more measurement would help"),
+    "samples": ("4 By {by}", "what was measured besides, where this selector wanted it, round by round"),
+    "known": ("4 Known, by age", "all that is known, bright where just measured; red where forgotten"),
+    "even": ("5 Even lattice", "the model of as many measurements, spread evenly"),
+    "model": ("5 Selective", "the model of those that were selected"),
+    "whole": ("5 Whole frame", "what the sensor measures with all its pixels"),
+    "truth": ("5 Truth", "what a perfect sensor would measure"),
+    "even_error": ("5 Error, even", "how far the even lattice's model is off"),
+    "error": ("5 Error, selective", "how far the selective one is off, on the same scale"),
+    "space": ("In space", "the cloud, the camera and what was measured"),
+}
+"""What each picture is called, and what it shows."""
+
+VISITORS_GUIDE = """\
+**Both models are made of equally many measurements**: of an even lattice, and of those that a selector \
+asked for, where they tell most. *Light* in an error is off by centimetres, *dark* by millimetres.
+"""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What there is to see in a run.
 
     Parameters
     ----------
-    by : str or None
-        What drives the shots, if a budget is spent: samples, model and error have views only then.
+    by : str, default ""
+        What drives the shots, if a budget is spent: samples, models and errors have views only then.
+    rounds : int, default 0
+        In how many rounds.
+    visitor : bool, default False
+        Whether it is for those who come by: large pictures, no times and no figures.
+    detail : bool, default False
+        Whether the inner read-outs have views too.
     memory : bool, default False
         Whether what is known lasts: its age and what was forgotten have a view then.
-    detail : bool
-        Whether the inner read-outs have views too.
     colour : bool, default False
         Whether there is a colour image.
-    coloured_cloud : bool, default False
+    registered : bool, default False
         Whether it lies on the depth image, so that the cloud has its colours.
+    truth : bool, default False
+        Whether exact depth is known.
+    live : bool, default False
+        Whether a sensor delivers, whose state may change.
+    hide : tuple of str, optional
+        Layers that are not shown: colour, cloud, nodes, triangles, samples.
+    """
+
+    by: str = ""
+    rounds: int = 0
+    visitor: bool = False
+    detail: bool = False
+    memory: bool = False
+    colour: bool = False
+    registered: bool = False
+    truth: bool = False
+    live: bool = False
+    hide: tuple[str, ...] = ()
+
+    @property
+    def titles(self) -> dict[str, tuple[str, str]]:
+        """Title and meaning of each picture that there is, by its key in `TITLES`; a visitor's have no numbers."""
+        there = {
+            "scene": self.colour and "colour" not in self.hide,
+            "gas": not (self.visitor and self.by),
+            "known": self.memory,
+            "whole": self.by and not self.truth,
+            "truth": self.by and self.truth,
+        } | dict.fromkeys(("samples", "even", "model", "even_error", "error"), self.by)
+        there["score"] = there["seeds"] = there["gas"]
+        titles = {key: words for key, words in TITLES.items() if there.get(key, True)}
+        return {key: (self._title(title), meaning) for key, (title, meaning) in titles.items()}
+
+    @property
+    def plots(self) -> dict[str, tuple[str, list[str]]]:
+        """Plots of running figures by their key: title, and names out of `palette.FIGURES`."""
+        errors = ["quantisation_error_mm", *["rmse_mm", "even_rmse_mm"] * bool(self.by)]
+        errors += ["truth_rmse_mm", "sensor_rmse_mm"] * bool(self.by and self.truth)
+        plots = {"fps": ("Frames/s", ["fps"])}
+        plots["dropped"] = ("Dropped", ["dropped_sensor"] * self.live + ["dropped_viewer"])
+        plots["errors"] = ("Errors, mm", errors)
+        if self.memory:
+            plots["pixels"] = ("Pixels, %", ["measured_percent", "known_percent"])
+        return plots
+
+    def _title(self, title: str) -> str:
+        number, _, rest = title.partition(" ")
+        told = rest.replace("By", "Measured by") if self.visitor and number[0].isdigit() else title
+        return told.format(by=self.by.removesuffix(", with memory"))
+
+    @property
+    def guide(self) -> str:
+        """What each picture shows, in Markdown; for visitors, what it comes to."""
+        if self.visitor and self.by:
+            return VISITORS_GUIDE
+        lines = [
+            f"- **{title}** – {meaning}"
+            for key, (title, meaning) in self.titles.items()
+            if not self.visitor or key in ("gas", "score")
+        ]
+        return "\n".join(["From left to right: measured → wanted → known.\n"] * (not self.visitor) + lines)
+
+    def legend(self, limits_mm: tuple[float, float]) -> legend.Image:
+        """The colours of these pictures."""
+        scales, swatches = [legend.depth_scale(limits_mm)], [(legend.UNKNOWN, legend.HOLE)]
+        if "gas" in self.titles:
+            scales.append(legend.IMPROVEMENT)
+            swatches += [("kept triangles: regions selected", legend.REGION | 0xFF), ("neural-gas nodes", legend.NODE)]
+        if self.by:
+            scales += [legend.ERROR, legend.AGE if self.memory else legend.round_scale(self.rounds)]
+        swatches += [("forgotten in this frame", legend.FORGOTTEN | 0xFF)] * self.memory
+        return legend.picture(scales, swatches, 2 if self.visitor else 1)
+
+
+def blueprint(shown: Shown, look_at_m: float = 2.0, limits_mm: tuple[float, float] = (500.0, 5000.0)) -> rrb.Blueprint:
+    """Layout of the viewer: the pictures in the order of the method, and beside them what they mean.
+
+    Parameters
+    ----------
+    shown : Shown
+        What there is to see.
     look_at_m : float, default 2.0
         Depth around which the view in space turns, in metres.
     limits_mm : tuple of float, default (500, 5000)
         Ends of the depth scale.
     """
-    grey = _grey(limits_mm)
-    gas = _image("3a Neural gas", "gas/mask", "gas/triangles", "gas/nodes", over=grey)
-    gas_long = _image("3a Long edges", "gas/complement", over=grey)
-    score = _image("3b Improvement", "improvement/score", "improvement/unknown")
-    estimate = _image("3b Estimate", "improvement/estimate", "improvement/unknown")
-    deviation = _image("3b Deviation", "improvement/deviation", "improvement/unknown")
-    columns: list[rrb.Container | rrb.View] = [
-        rrb.Vertical(
-            *([rrb.Spatial2DView(origin="/colour", name="Scene", background=legend.BACKGROUND)] if colour else []),
-            _image("1 Sensor", "depth", "holes"),
-            _image("2 Seeds", "seeds"),
-        ),
-        rrb.Vertical(
-            rrb.Tabs(gas, gas_long) if detail else gas, rrb.Tabs(score, estimate, deviation) if detail else score
-        ),
-    ]
-    cloud = "/world/cloud" if coloured_cloud else "/camera/depth"
-    space = ["/camera", cloud, "/world/nodes", "/world/regions", *(["/colour"] if colour else [])]
-    if by is not None:
-        samples = _image(f"4 Acquired by {by}", "samples", "holes")
-        known = _image("4 Known, by age", "memory/age", "memory/changed")
-        columns.append(
-            rrb.Vertical(
-                rrb.Tabs(known, samples) if memory else samples,
-                rrb.Tabs(_image("5 Error", "error", "holes"), _image("5 Model", "model")),
-            )
-        )
-        space.append("/world/samples")
-    eye = rrb.EyeControls3D(
-        position=(-0.5 * look_at_m, -0.45 * look_at_m, -0.45 * look_at_m),
-        look_target=(0, 0, look_at_m),
-        eye_up=(0, -1, 0),
-    )
-    columns.append(
-        rrb.Spatial3DView(origin="/", contents=space, name="In space", eye_controls=eye, background=legend.BACKGROUND)
-    )
-    shares = [1.0] * (len(columns) - 1) + [1.6]
+    views = _views(shown, look_at_m, limits_mm)
+    parts: list[Part] = [_line()] if shown.by else []
+    shares = [0.09 if shown.visitor else 0.055] if shown.by else []
+    if shown.visitor:
+        parts += [_pictures_for_visitors(shown, views), rrb.Horizontal(*_colours(titlebar=False))]
+        shares += [1.0, 0.12]
+    else:
+        parts.append(rrb.Horizontal(_pictures(shown, views), _figures(shown), column_shares=[4, 1.08]))
+        shares.append(1.0)
     return rrb.Blueprint(
-        rrb.Vertical(rrb.Horizontal(*columns, column_shares=shares), _figures(memory), row_shares=[2.2, 1]),
-        rrb.TimePanel(timeline="frame", play_state="following", state="collapsed"),
+        rrb.Vertical(*parts, row_shares=shares),
+        rrb.TimePanel(timeline="time", play_state="following", state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         auto_views=False,
     )
+
+
+def _views(shown: Shown, look_at_m: float, limits_mm: tuple[float, float]) -> dict[str, Part]:
+    """A view of each picture that there is, by its key in `TITLES`."""
+    grey = _grey(limits_mm)
+    over = {"gas": grey}
+    contents = {
+        "sensor": ("depth", "holes"),
+        "seeds": ("seeds",),
+        "gas": ("gas/mask", *(f"gas/{layer}" for layer in ("triangles", "nodes") if layer not in shown.hide)),
+        "score": ("improvement/score",),
+        "samples": ("samples", "holes"),
+        "known": ("memory/age", "memory/changed"),
+        "even": ("even",),
+        "model": ("model",),
+        "whole": ("depth", "holes"),
+        "truth": ("truth",),
+        "even_error": ("errors/even",),
+        "error": ("errors/selective",),
+    }
+    titles = {key: title for key, (title, _) in shown.titles.items()}
+    views: dict[str, Part] = {
+        key: _image(titles[key], *entities, over=over.get(key)) for key, entities in contents.items() if key in titles
+    }
+    if "scene" in titles:
+        views["scene"] = rrb.Spatial2DView(origin="/colour", name=titles["scene"], background=legend.BACKGROUND)
+    if shown.detail and "gas" in titles:
+        views["gas"] = rrb.Tabs(views["gas"], _image("Long edges", "gas/complement", over=grey))
+        estimate = _image("Estimate", "improvement/estimate", "improvement/unknown")
+        views["score"] = rrb.Tabs(views["score"], estimate, _image("Deviation", "errors/expected"))
+    away_m = look_at_m * (0.4 if shown.by else 0.5)  # without a budget the view is taller than wide
+    eye = rrb.EyeControls3D(
+        position=(-away_m, -0.9 * away_m, look_at_m - 3 * away_m), look_target=(0, 0, look_at_m), eye_up=(0, -1, 0)
+    )
+    views["space"] = rrb.Spatial3DView(
+        origin="/",
+        contents=["/camera", *_in_space(shown)],
+        name=titles["space"],
+        eye_controls=eye,
+        background=legend.BACKGROUND,
+    )
+    return views
+
+
+def _in_space(shown: Shown) -> list[str]:
+    """What lies in the view in space beside the camera."""
+    layers = {
+        "cloud": ["/world/cloud" if shown.registered else "/camera/depth"],
+        "colour": ["/colour"] * shown.colour,
+        "samples": ["/world/samples"] * bool(shown.by),
+    }
+    if "gas" in shown.titles:
+        layers |= {"nodes": ["/world/nodes"], "triangles": ["/world/regions"]}
+    return [entity for layer, entities in layers.items() if layer not in shown.hide for entity in entities]
+
+
+def _columns(views: dict[str, Part], *columns: tuple[str, ...]) -> list[rrb.Vertical]:
+    """Pictures under each other, in columns; those that are not there leave no gap."""
+    return [rrb.Vertical(*(views[key] for key in column if key in views)) for column in columns]
+
+
+def _pictures(shown: Shown, views: dict[str, Part]) -> rrb.Horizontal:
+    """All of them: what is measured, then wanted; with a budget, what both models are like below."""
+    if not shown.by:
+        columns = _columns(views, ("scene", "sensor", "seeds"), ("gas", "score"), ("space",))
+        return rrb.Horizontal(*columns, column_shares=[0.9, 1, 1.7])
+    if "known" in views:
+        views["samples"] = rrb.Tabs(views["known"], views["samples"])
+    views["colours"] = rrb.Tabs(*_colours())
+    last = "truth" if shown.truth else "whole"
+    columns = _columns(
+        views,
+        ("scene", "sensor", "seeds", "samples"),
+        ("gas", "even", "even_error"),
+        ("score", "model", "error"),
+        ("space", last, "colours"),
+    )
+    return rrb.Horizontal(*columns, column_shares=[0.9, 1, 1, 1])
+
+
+def _pictures_for_visitors(shown: Shown, views: dict[str, Part]) -> rrb.Horizontal:
+    """Few and large: the two models side by side, or without a budget what the selectors find."""
+    if not shown.by:
+        columns = _columns(views, ("scene" if "scene" in views else "seeds", "sensor"), ("gas", "score"), ("space",))
+        return rrb.Horizontal(*columns, column_shares=[1, 1, 1.6])
+    if "scene" in views:
+        views["sensor"] = rrb.Tabs(views["scene"], views["sensor"])
+    taken, last = "known" if shown.memory else "samples", "truth" if shown.truth else "whole"
+    return rrb.Horizontal(
+        *_columns(views, ("sensor", taken), ("even", "even_error"), ("model", "error"), (last, "space"))
+    )
+
+
+def _line() -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(origin="/line", name="The gain", titlebar=False, background=legend.BACKGROUND)
+
+
+def _colours(titlebar: bool = True) -> list[rrb.View]:
+    """The legend and the guide."""
+    colours = rrb.Spatial2DView(origin="/legend", name="Colours", background=legend.BACKGROUND, titlebar=titlebar)
+    return [colours, rrb.TextDocumentView(origin="/guide", name="Guide", titlebar=titlebar)]
 
 
 def _image(name: str, *entities: str, over: rr.DepthImage | None = None) -> rrb.Spatial2DView:
@@ -101,27 +278,25 @@ def _grey(limits_mm: tuple[float, float]) -> rr.DepthImage:
     return rr.DepthImage.from_fields(colormap="grayscale", depth_range=dim_range)
 
 
-def _figures(memory: bool) -> rrb.Horizontal:
-    """The lower row: what is seen above, and how the run fares."""
+def _figures(shown: Shown) -> rrb.Vertical:
+    """How the run fares: plots, each with its key beside it, and the sensor's state."""
 
-    def plot(name: str, *figures: str) -> rrb.TimeSeriesView:
-        contents = [f"/figures/{figure}" for figure in figures]
-        return rrb.TimeSeriesView(origin="/figures", contents=contents, name=name, plot_legend=rrb.Corner2D.LeftTop)
+    def plot(key: str, title: str, names: list[str]) -> Part:
+        view = rrb.TimeSeriesView(
+            origin="/figures",
+            contents=[f"/figures/{name}" for name in names],
+            name=title,
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
+        beside = rrb.Spatial2DView(origin=f"/keys/{key}", titlebar=False, name=f"{title}: lines",
+                                   background=legend.BACKGROUND)  # fmt: skip
+        return view if len(names) == 1 and key != "stages" else rrb.Horizontal(view, beside, column_shares=[2.6, 1])
 
-    errors = ("rmse_mm", "truth_rmse_mm", "sensor_rmse_mm", "even_rmse_mm")
-    return rrb.Horizontal(
-        rrb.TextDocumentView(origin="/guide", name="How to read it"),
-        rrb.Spatial2DView(origin="/legend", name="Colours", background=legend.BACKGROUND),
-        plot("Milliseconds per stage", "stages"),
-        rrb.Vertical(
-            plot("Rate and drops", "fps", "dropped_sensor", "dropped_viewer"),
-            rrb.StateTimelineView(origin="/sensor/state", name="Sensor"),
-            row_shares=[2, 1],
-        ),
-        plot("Errors in mm", "quantisation_error_mm", *errors),
-        *([plot("Pixels, %", "measured_percent", "known_percent")] if memory else []),
-        column_shares=[1.15, 1.15, 1, 0.9, 0.9, *([0.9] if memory else [])],
-    )
+    plots = [plot("stages", "Stages, ms", ["stages"])]
+    plots += [plot(key, *of) for key, of in shown.plots.items()]
+    states = [rrb.StateTimelineView(origin="/sensor/state", name="Sensor")] * shown.live
+    first = [] if shown.by else [rrb.Tabs(*_colours())]
+    return rrb.Vertical(*first, *plots, *states)
 
 
 def epoch_blueprint(limits_mm: tuple[float, float]) -> rrb.Blueprint:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 
 import cv2
@@ -11,9 +12,9 @@ import pyarrow as pa
 import rerun as rr
 
 from selective_depth.app.pictures import palette as legend
-from selective_depth.app.pipeline import STAGES, FrameResult
+from selective_depth.app.pipeline import STAGES, Even, FrameResult, Model
 from selective_depth.app.settings import ViewerOptions
-from selective_depth.app.viewer.blueprint import blueprint, epoch_blueprint
+from selective_depth.app.viewer.blueprint import Shown, blueprint, epoch_blueprint
 from selective_depth.drivers.colour import jpeg_of
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.selectors.arrays import pixels_where
@@ -23,6 +24,8 @@ from selective_depth.selectors.neural_gas import RegionSelection
 DEPTH_COLOURS = legend.palette(legend.DEPTH_COLOURMAP)
 CENTRE = np.float32(0.5)
 """Rerun puts pixel centres at halves, we at whole numbers."""
+USUAL_US = 33_333
+"""From one frame to the next, where their times do not tell."""
 JPEG_QUALITY = 80
 CLOUD_STEP = 3
 """The coloured cloud has every third pixel each way: all of them would be 5 MB a frame."""
@@ -42,28 +45,30 @@ class StepLogger:
     def __init__(self, stream: rr.RecordingStream, options: ViewerOptions) -> None:
         self._stream = stream
         self._options = options
-        self._start_us: int | None = None
+        self._shown: Shown | None = None
+        self._timestamp_us, self._elapsed_s, self._logged_s = 0, 0.0, 0.0
         self._state = ""
+        self._line = ""
         self._limits_mm = (0.0, 1.0)
-        self._coloured = False
 
     def log(self, step: FrameResult) -> None:
         """Log a step under its frame's number and time."""
-        if self._start_us is None:
-            self._start_us = step.frame.timestamp_us
+        if self._shown is None:
             self._log_static(step)
-        if step.frame.colour is not None and not self._coloured:  # a sensor's may come a little later
-            self._coloured = True
-            self._send_blueprint(step)
-            if step.frame.colour_camera is not None:
-                self._log_camera(step.frame.colour_camera, "colour")
+        else:
+            # A clock that stands, or that a recording played again sets back, is helped on.
+            gone_us = step.frame.timestamp_us - self._timestamp_us
+            self._elapsed_s += (gone_us if gone_us > 0 else USUAL_US) / 1e6
+        self._timestamp_us, self._logged_s = step.frame.timestamp_us, time.monotonic()
+        shown = self._shown_of(step)
+        if shown != self._shown:  # a sensor's colour may come a little later
+            self._lay_out(shown, step)
         self._stream.set_time("frame", sequence=step.frame.index)
-        elapsed_us = step.frame.timestamp_us - self._start_us
-        self._stream.set_time("time", duration=elapsed_us / 1e6)
+        self._stream.set_time("time", duration=self._elapsed_s)
         self._log_sensor(step)
         self._log_colour(step.frame)
-        self._log_gas(step.regions)
-        self._log_improvement(step)
+        self._log_gas(step.regions, shown.detail)
+        self._log_improvement(step, shown.detail)
         self._log_acquisition(step)
         if step.memory is not None:
             self._log_memory(step.memory)
@@ -82,13 +87,18 @@ class StepLogger:
         self._stream.log("camera/holes", holes, static=True)
         for epoch, regions in trainings:
             self._stream.set_time("epoch", sequence=epoch)
-            self._log_gas(regions)
+            self._log_gas(regions, detail=True)
             error = rr.Scalars(regions.quantisation_error_mm)
             self._stream.log("figures/quantisation_error_mm", error)
 
     def log_state(self, state: str) -> None:
-        """Log the sensor's state, if it has changed, under the time of the last step."""
-        if state != self._state and self._start_us is not None:
+        """Log the sensor's state without a frame, as long after the last one as it is on the wall."""
+        if self._shown is not None:
+            self._stream.set_time("time", duration=self._elapsed_s + time.monotonic() - self._logged_s)
+            self._log_change(state)
+
+    def _log_change(self, state: str) -> None:
+        if state != self._state:
             self._state = state
             self._stream.log("sensor/state", rr.StateChange(state=state))
 
@@ -98,37 +108,50 @@ class StepLogger:
         near = near if options.near_mm is None else options.near_mm
         far = far if options.far_mm is None else options.far_mm
         self._limits_mm = (float(near), float(max(far, near + 1)))
-        self._send_blueprint(step)
         self._stream.send_recording_name(step.frame.source or "depth")
         self._log_camera(step.frame.camera)
         pixels = step.seeds.lattice_uv.reshape(-1, 2) + CENTRE
         log("camera/seeds", rr.Points2D.from_fields(positions=pixels, radii=1.6), static=True)
         self._log_classes()
-        rounds = 0 if step.acquisition is None else int(step.acquisition.round.max(initial=0))
-        log("legend", rr.Image(legend.picture(self._limits_mm, rounds)), static=True)
-        log("guide", rr.TextDocument(legend.HOW_TO_READ, media_type="text/markdown"), static=True)
         states = rr.StateConfiguration(
             values=list(legend.STATE_COLOURS),
             labels=list(legend.STATE_COLOURS),
             colors=list(legend.STATE_COLOURS.values()),
         )
         log("sensor/state", states, static=True)
-        stages = rr.SeriesLines(names=list(STAGES), colors=list(legend.STAGE_COLOURS))
-        log("figures/stages", stages, static=True)
+        names = [name.replace("_", " ") for name in STAGES]
+        log("figures/stages", rr.SeriesLines(names=names, colors=list(legend.STAGE_COLOURS)), static=True)
         for name, (label, colour) in legend.FIGURES.items():
             log(f"figures/{name}", rr.SeriesLines(names=label, colors=colour), static=True)
+        log("keys/stages", _png(legend.key(list(zip(names, legend.STAGE_COLOURS, strict=True)))), static=True)
 
-    def _send_blueprint(self, step: FrameResult) -> None:
-        layout = blueprint(
-            by=None if step.acquisition is None else step.acquisition.by,
-            detail=self._options.detail,
+    def _shown_of(self, step: FrameResult) -> Shown:
+        """What there is to see in a step; what was there once stays."""
+        acquisition, before, look = step.acquisition, self._shown or Shown(), step.look or self._options
+        return Shown(
+            by="" if acquisition is None else acquisition.by or "a selector",
+            rounds=max(before.rounds, 0 if acquisition is None else int(acquisition.round.max(initial=0))),
+            visitor=look.layout == "visitor",
+            detail=look.detail,
+            hide=look.hide,
             memory=step.memory is not None,
-            colour=self._coloured,
-            coloured_cloud=self._coloured and step.frame.registered,
-            look_at_m=_middle_m(step.frame.depth_mm),
-            limits_mm=self._limits_mm,
+            colour=before.colour or step.frame.colour is not None,
+            registered=before.registered or (step.frame.colour is not None and step.frame.registered),
+            truth=before.truth or step.frame.truth_mm is not None,
+            live=before.live or step.state != "replay",
         )
+
+    def _lay_out(self, shown: Shown, step: FrameResult) -> None:
+        """Send the layout of what there is to see, and what explains it."""
+        self._shown = shown
+        layout = blueprint(shown, _middle_m(step.frame.depth_mm), self._limits_mm)
         self._stream.send_blueprint(layout, make_default=True)
+        if step.frame.colour_camera is not None:
+            self._log_camera(step.frame.colour_camera, "colour")
+        self._stream.log("legend", _png(shown.legend(self._limits_mm)), static=True)
+        for plot, (_, names) in shown.plots.items():
+            self._stream.log(f"keys/{plot}", _png(legend.key([legend.FIGURES[name] for name in names])), static=True)
+        self._stream.log("guide", rr.TextDocument(shown.guide, media_type="text/markdown"), static=True)
 
     def _log_camera(self, camera: Camera, entity: str = "camera") -> None:
         log = self._stream.log
@@ -151,6 +174,14 @@ class StepLogger:
         log("camera/gas", rr.AnnotationContext([nothing, kept, long]), static=True)
         forgotten = (1, "forgotten in this frame", legend.FORGOTTEN)
         log("camera/memory", rr.AnnotationContext([nothing, forgotten]), static=True)
+        for entity, scale, unknown in (
+            ("camera/improvement/score", legend.IMPROVEMENT, (0, legend.UNKNOWN, legend.HOLE)),
+            ("camera/errors", legend.ERROR, (0, legend.UNKNOWN, legend.HOLE)),
+            ("camera/memory/age", legend.AGE, nothing),
+        ):
+            levels = enumerate(legend.palette(scale.colormap).tolist())
+            classes = [(level, scale.told((level - 1) / 254), colour) for level, colour in levels if level]
+            log(entity, rr.AnnotationContext([unknown, *classes]), static=True)
 
     def _log_sensor(self, step: FrameResult) -> None:
         log, depth_mm, seeds = self._stream.log, step.frame.depth_mm, step.seeds
@@ -160,7 +191,7 @@ class StepLogger:
         level = np.clip((seeds.depth_mm.ravel() - near) * (255 / (far - near)), 0, 255)
         colours = np.where(seeds.valid.ravel(), DEPTH_COLOURS[level.astype(np.uint8)], np.uint32(legend.HOLE))
         log("camera/seeds", rr.Points2D.from_fields(colors=colours))
-        self.log_state(step.state)
+        self._log_change(step.state)
 
     def _log_colour(self, frame: DepthFrame) -> None:
         """The colour image, as JPEG: a twentieth of its bytes; where it lies on depth, a cloud in its colours."""
@@ -174,10 +205,10 @@ class StepLogger:
             packed = frame.colour[uv[:, 1], uv[:, 0]] @ np.array((1 << 24, 1 << 16, 1 << 8), np.uint32) | np.uint32(255)
             self._stream.log("world/cloud", rr.Points3D(points_m, colors=packed, radii=-1.8))
 
-    def _log_gas(self, regions: RegionSelection) -> None:
+    def _log_gas(self, regions: RegionSelection, detail: bool = False) -> None:
         log = self._stream.log
         log("camera/gas/mask", rr.SegmentationImage(regions.mask.view(np.uint8)))
-        if self._options.detail:
+        if detail:
             complement = rr.SegmentationImage(regions.complement.astype(np.uint8) * 2)
             log("camera/gas/complement", complement)
         nodes_uv, kept = regions.nodes_uv + CENTRE, regions.triangles[regions.kept]
@@ -190,16 +221,15 @@ class StepLogger:
         mesh = rr.Mesh3D(vertex_positions=nodes_m, triangle_indices=kept, albedo_factor=legend.REGION)
         log("world/regions", mesh)
 
-    def _log_improvement(self, step: FrameResult) -> None:
+    def _log_improvement(self, step: FrameResult, detail: bool) -> None:
         log, improvement = self._stream.log, step.improvement
         known = improvement.known
-        log("camera/improvement/score", _map_image(improvement.score, legend.IMPROVEMENT, known))
-        log("camera/improvement/unknown", rr.SegmentationImage((~known).view(np.uint8), opacity=1.0))
-        if self._options.detail:
+        log("camera/improvement/score", _level_image(legend.IMPROVEMENT, improvement.score, known))
+        if detail:
+            log("camera/improvement/unknown", rr.SegmentationImage((~known).view(np.uint8), opacity=1.0))
             log("camera/improvement/estimate", self._depth_image(_as_depth(improvement.estimate_mm)))
             deviation_mm = np.sqrt(np.where(known, improvement.variance_mm2, 0))
-            image = _map_image(deviation_mm, legend.ERROR, known)
-            log("camera/improvement/deviation", image)
+            log("camera/errors/expected", _level_image(legend.ERROR, deviation_mm, known))
 
     def _log_acquisition(self, step: FrameResult) -> None:
         log, acquisition = self._stream.log, step.acquisition
@@ -207,22 +237,35 @@ class StepLogger:
             return
         shot = acquisition.round > 0
         uv, depth_mm, rounds = (array[shot] for array in (acquisition.uv, acquisition.depth_mm, acquisition.round))
-        colours = legend.round_colours(int(rounds.max(initial=0)))[rounds]
+        colours = legend.round_colours(self._shown.rounds if self._shown else 0)[rounds]
         log("camera/samples", rr.Points2D(uv + CENTRE, colors=colours, radii=0.9))
         hit = depth_mm > 0
         points_m = step.frame.camera.points_mm(uv[hit], depth_mm[hit]) * np.float32(0.001)
         log("world/samples", rr.Points3D(points_m, colors=colours[hit], radii=-1.5))
+        if step.gain and step.gain != self._line:
+            self._line = step.gain
+            log("line", _png(legend.headline(step.gain)))
         if step.model is not None:
-            log("camera/model", self._depth_image(_as_depth(step.model.depth_mm)))
-            error_mm = step.model.error_mm
-            known = ~np.isnan(error_mm)
-            log("camera/error", _map_image(error_mm, legend.ERROR, known))
+            self._log_models(step.frame, step.model, to_truth=step.memory is not None)
+
+    def _log_models(self, frame: DepthFrame, model: Model, to_truth: bool) -> None:
+        """The model and the even lattice's, each with its error; the truth, where it is known.
+
+        Errors are what the line tells: to the frame, or with a memory to the truth, if that is known.
+        """
+        log, even = self._stream.log, model.even
+        against = frame if to_truth and frame.truth_mm is not None else None
+        log("camera/model", self._depth_image(_as_depth(model.depth_mm)))
+        log("camera/errors/selective", _error_image(model, against))
+        if even is not None:
+            log("camera/even", self._depth_image(_as_depth(even.depth_mm)))
+            log("camera/errors/even", _error_image(even, against))
+        if frame.truth_mm is not None:
+            log("camera/truth", self._depth_image(frame.truth_mm))
 
     def _log_memory(self, memory: TemporalStep) -> None:
         """Age of what is known, fresh bright, and what was forgotten in this frame."""
-        level = np.where(memory.known, 255 - np.minimum(8 * memory.age_frames, 200), 0)
-        image = rr.DepthImage(level.astype(np.uint8), colormap=legend.AGE_COLOURMAP, depth_range=[0.0, 255.0])
-        self._stream.log("camera/memory/age", image)
+        self._stream.log("camera/memory/age", _level_image(legend.AGE, memory.age_frames, memory.known))
         changed = np.zeros_like(memory.changed) if memory.restarted else memory.changed
         self._stream.log("camera/memory/changed", rr.SegmentationImage(changed.view(np.uint8)))
 
@@ -247,12 +290,28 @@ def _as_depth(value_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
     return np.where(value_mm > 0, value_mm, np.float32(0)).astype(np.uint16)
 
 
-def _map_image(value: npt.NDArray[np.float32], scale: legend.Scale, known: npt.NDArray[np.bool_]) -> rr.DepthImage:
-    """Values on a scale from 0 as a coloured 8-bit image: 1..255, and 0 where nothing is known."""
-    # Saturates in one pass; what it makes of a NaN does not matter, that is nowhere known.
-    levels = np.asarray(cv2.convertScaleAbs(value, alpha=254 / scale.limits[1], beta=1))
-    np.multiply(levels, known, out=levels)
-    return rr.DepthImage(levels, colormap=scale.colormap, depth_range=[1.0, 255.0])
+def _error_image(model: Model | Even, against: DepthFrame | None) -> rr.SegmentationImage:
+    """How far a model is off from its own frame, or from the truth of another."""
+    if against is None or against.truth_mm is None:
+        return _level_image(legend.ERROR, model.error_mm, ~np.isnan(model.error_mm))
+    seen = (against.depth_mm > 0) & (against.truth_mm > 0)
+    return _level_image(legend.ERROR, np.abs(model.depth_mm - against.truth_mm), seen)
+
+
+def _level_image(
+    scale: legend.Scale, values: npt.NDArray[np.generic], known: npt.NDArray[np.bool_]
+) -> rr.SegmentationImage:
+    """Values on a scale as its levels 1..255, whose colours and meaning are classes; 0 where nothing is known.
+
+    So a map has colours that Rerun does not know, and takes a byte a pixel.
+    """
+    levels = cv2.convertScaleAbs(scale.place(values), alpha=254, beta=1)
+    return rr.SegmentationImage(np.multiply(levels, known, dtype=np.uint8), opacity=1.0)
+
+
+def _png(image: legend.Image) -> rr.EncodedImage:
+    """A drawing, in a twentieth of its bytes."""
+    return rr.EncodedImage(contents=cv2.imencode(".png", image[:, :, ::-1])[1].tobytes(), media_type="image/png")
 
 
 def _closed_strips(points_uv: npt.NDArray[np.float32]) -> pa.Array:

@@ -14,7 +14,7 @@ import rerun as rr
 from selective_depth.app.console.output import cannot_write
 from selective_depth.app.pipeline import FrameResult, SensorNote
 from selective_depth.app.settings import ViewerOptions
-from selective_depth.app.viewer.blueprint import blueprint
+from selective_depth.app.viewer.blueprint import Shown, blueprint
 from selective_depth.app.viewer.logger import StepLogger
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.frame import DepthFrame
@@ -58,7 +58,7 @@ class Recording:
         self._stream.set_sinks(target)
         # The SDK imports half of what it needs at first use, which takes it up to a second:
         # that is now, and not while the first frames come.
-        blueprint(by="", detail=True)
+        blueprint(Shown(by="it", detail=True))
         self._logger = StepLogger(self._stream, options)
 
     @classmethod

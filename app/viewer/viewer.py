@@ -205,5 +205,5 @@ def _handover(place: Place, live: bool) -> Handover[FrameResult | SensorNote]:
 def _application(title: str, options: ViewerOptions) -> str:
     """Application id of a run: letters, digits, dashes; the same for the same layout only."""
     limits = f"{options.near_mm}-{options.far_mm}" if options.near_mm or options.far_mm else ""
-    words = (APPLICATION, title, "detail" * options.detail, limits)
+    words = (APPLICATION, title, options.layout, "detail" * options.detail, limits)
     return " ".join(re.sub(r"[^A-Za-z0-9_-]+", " ", " ".join(words)).split())

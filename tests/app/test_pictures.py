@@ -13,6 +13,7 @@ from selective_depth.app.commands.snapshot import short_name, snapshot, still_ro
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pictures import StillRow, contact_sheet, palette, write_picture
 from selective_depth.app.pictures import panels as parts
+from selective_depth.app.pictures.palette import Scale
 from selective_depth.app.settings import AcquireOptions, GasOptions, PictureOptions, Settings
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.folder import write_folder
@@ -64,10 +65,27 @@ def test_near_is_darker_than_far_as_in_the_viewer(row: StillRow) -> None:
     assert grey[120, 160] < grey[200, 300] - 40
 
 
-def test_a_scale_is_linear_between_its_limits_and_dark_where_nothing_is_known() -> None:
-    colours = palette.channels(palette.palette(palette.ERROR.colormap))
-    shown = palette.ERROR.colour(np.array([-5.0, 0.0, 20.0, 100.0, 1e9, np.nan]))
-    np.testing.assert_array_equal(shown, colours[[0, 0, 51, 255, 255, 0]])
+def test_colours_of_a_scale_go_from_limit_to_limit_and_are_dark_where_nothing_is_known() -> None:
+    values = np.array([-5.0, 0.0, 20.0, 100.0, 1e9, np.nan])
+    linear = Scale("any", "ice", (0.0, 100.0))
+    colours = palette.channels(palette.palette("ice"))
+    np.testing.assert_array_equal(linear.colour(values), colours[[0, 0, 51, 255, 255, 0]])
+    np.testing.assert_array_equal(replace(linear, root=True).colour(values), colours[[0, 0, 114, 255, 255, 0]])
+
+
+def test_a_bar_names_values_where_their_colours_are() -> None:
+    ticks = palette.ERROR.ticks
+    assert [text for _, text in ticks] == ["0", "5", "25", "100 mm"]
+    for at, text in ticks:
+        value = float(text.split()[0])
+        np.testing.assert_array_equal(palette.ERROR.colour(value), palette.ERROR.bar[round(255 * at)])
+    assert len(palette.round_scale(4).bar) == 4
+
+
+def test_no_two_quantities_share_colours() -> None:
+    scales = (palette.depth_scale((500, 5000)), palette.IMPROVEMENT, palette.ERROR, palette.AGE)
+    assert len({scale.colormap for scale in scales}) == len(scales)
+    assert palette.round_scale(3).colormap == palette.AGE.colormap  # both tell when something was measured
 
 
 def test_the_map_is_brightest_along_the_step(row: StillRow) -> None:

@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -23,110 +24,16 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 from rerun_listener import Listener
+from steps import HEADLESS, HEIGHT, WIDTH, images_of, make_step, rows_of, save
 
 from selective_depth.app import cli
 from selective_depth.app.console.errors import UsageError, ViewerError
-from selective_depth.app.pictures import palette as legend
-from selective_depth.app.pipeline import STAGES, FrameResult, Model, SensorNote, StageTimes
-from selective_depth.app.settings import ViewerOptions
+from selective_depth.app.pictures import palette
+from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes
 from selective_depth.app.viewer import Viewer, screenshot, sinks, viewer, window
-from selective_depth.app.viewer.blueprint import blueprint
 from selective_depth.app.viewer.logger import DEPTH_COLOURS
 from selective_depth.app.viewer.stream import Recording
 from selective_depth.drivers.errors import OutputError
-from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.selectors.acquire.loop import Acquisition, Round
-from selective_depth.selectors.improvement import ImprovementSelection
-from selective_depth.selectors.neural_gas import delaunay_regions
-from selective_depth.selectors.seeds import SeedGrid
-
-HEIGHT, WIDTH = 48, 64
-HEADLESS = ViewerOptions(headless=True)
-
-
-def make_step(index: int, *, acquiring: bool = True) -> FrameResult:
-    """A small step with holes, made by hand: the viewer is tested, not the selectors."""
-    rng = np.random.default_rng(index)
-    depth_mm = rng.integers(600, 4000, (HEIGHT, WIDTH)).astype(np.uint16)
-    depth_mm[5:12, 20:30] = 0
-    camera = Camera.kinect(WIDTH, HEIGHT)
-    frame = DepthFrame(depth_mm, index, 1_000_000 + index * 33_333, camera, "made/by hand")
-    seeds = SeedGrid.from_frame(frame, (12, 16))
-    known = depth_mm > 0
-    score = np.where(known, rng.random((HEIGHT, WIDTH)), 0).astype(np.float32)
-    improvement = ImprovementSelection(
-        mask=score > 0.9,
-        score=score,
-        name="improvement",
-        estimate_mm=np.where(known, depth_mm, np.nan).astype(np.float32),
-        variance_mm2=np.where(known, 4.0, np.nan).astype(np.float32),
-        known=known,
-        raw=score,
-    )
-    regions = delaunay_regions(seeds.points_mm, seeds.uv.astype(np.float32), (HEIGHT, WIDTH))
-    acquisition = model = None
-    if acquiring:
-        uv = np.array([[3, 4], [25, 7], [50, 40]], dtype=np.int32)
-        acquisition = Acquisition(
-            uv=np.vstack((seeds.lattice_uv.reshape(-1, 2), uv)),
-            depth_mm=np.concatenate((seeds.depth_mm.ravel().astype(np.uint16), frame.measure(uv))),
-            round=np.array([0] * seeds.depth_mm.size + [1, 1, 2], dtype=np.uint8),
-            frame_shape=(HEIGHT, WIDTH),
-            rounds=(Round(2, 1), Round(1, 1)),
-        )
-        error_mm = np.where(known, 12.5, np.nan).astype(np.float32)
-        model = Model(depth_mm.astype(np.float32), error_mm, 12.5)
-    return FrameResult(
-        frame,
-        seeds,
-        regions,
-        improvement,
-        acquisition,
-        model,
-        stages_ms=dict.fromkeys(STAGES, 1.0),
-        figures=dict.fromkeys(legend.FIGURES, 2.0),
-    )
-
-
-def save(path: Path, steps: list[FrameResult], **options: Any) -> None:
-    chosen = dataclasses.replace(HEADLESS, save=path, **options)
-    shown = Viewer(chosen, live=False, times=StageTimes(), frames=100)
-    for step in steps:
-        shown.show(step)
-    assert shown.close() == []
-    assert sum(shown.dropped.values()) == 0
-
-
-def rows_of(path: Path) -> dict[str, int]:
-    """Rows that carry data, by entity; static ones included."""
-    rows: dict[str, int] = {}
-    for chunk in RrdReader(str(path)).stream():
-        rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
-    return rows
-
-
-def images_of(path: Path, entity: str, dtype: type[np.generic]) -> list[np.ndarray]:
-    """Images of an entity in the order of its frames, as they lie in the file."""
-    found = {}
-    for chunk in RrdReader(str(path)).stream():
-        if chunk.entity_path != entity or chunk.is_static:
-            continue
-        batch = chunk.to_record_batch()
-        buffer = next(n for n in batch.schema.names if n.endswith(":buffer"))
-        for frame, data in zip(batch.column("frame").to_pylist(), batch.column(buffer), strict=True):
-            pixels = np.asarray(data.values.flatten())
-            found[frame] = pixels.view(dtype).reshape(HEIGHT, WIDTH)
-    return [found[frame] for frame in sorted(found)]
-
-
-def views_of(part: Any) -> list[Any]:
-    """All views in a blueprint."""
-    children = getattr(part, "contents", None) or []
-    if hasattr(part, "root_container"):
-        return views_of(part.root_container)
-    if hasattr(part, "class_identifier") or isinstance(children, str):
-        return [part]
-    return [view for child in children for view in views_of(child)]
 
 
 def test_file_holds_every_step_bit_for_bit(tmp_path: Path) -> None:
@@ -143,22 +50,6 @@ def test_file_holds_every_step_bit_for_bit(tmp_path: Path) -> None:
         shown = (levels.astype(np.float32) - 1) / 254
         known = step.improvement.known
         assert np.abs(shown[known] - step.improvement.score[known]).max() <= 1 / 254
-
-
-@pytest.mark.parametrize("detail", [False, True])
-@pytest.mark.parametrize("acquiring", [False, True])
-def test_every_view_shows_something_that_was_logged(tmp_path: Path, acquiring: bool, detail: bool) -> None:
-    save(tmp_path / "out.rrd", [make_step(0, acquiring=acquiring)], detail=detail)
-    logged = rows_of(tmp_path / "out.rrd")
-    views = views_of(blueprint(by="step score" if acquiring else None, detail=detail))
-    assert len(views) >= (11 if acquiring else 8)
-    for view in views:
-        contents = view.contents
-        if isinstance(contents, str):
-            contents = [str(contents).replace("$origin", str(view.origin).rstrip("/"))]
-        for path in contents:
-            inside = [entity for entity in logged if entity.startswith(path.removesuffix("/**"))]
-            assert inside, f"view '{view.name}' shows {path}, which nobody logs"
 
 
 def test_sensor_state_is_logged_when_it_changes(tmp_path: Path) -> None:
@@ -444,10 +335,10 @@ def test_two_places_see_the_same(tmp_path: Path) -> None:
     assert len(images_of(tmp_path / "out.rrd", "/camera/depth", np.uint16)) == 5
 
 
-def picture_of(recording: Path, frame: int | None = None) -> np.ndarray:
+def picture_of(recording: Path, frame: int | None = None, **more: Any) -> np.ndarray:
     """A screenshot; no other trouble than a missing graphics driver is a reason to skip."""
     try:
-        return screenshot(recording, frame)
+        return screenshot(recording, frame, **more)
     except ViewerError as error:
         if "does not start" in str(error):
             pytest.skip(f"no graphics driver: {error}")
@@ -469,8 +360,34 @@ def test_a_picture_shows_the_frame_that_was_asked_for(tmp_path: Path) -> None:
         blue, green, red = (int(DEPTH_COLOURS[level]) >> shift & 255 for shift in (8, 16, 24))
         like = np.abs(view - (blue, green, red)).max(axis=1) < 12
         assert like.mean() > 0.3, "the frame's depth is not what is seen of the sensor"
-    with pytest.raises(UsageError, match=r"--frame is 3; the frames of .* are 0\.\.2"):
-        screenshot(recording, 3)
+    alone = picture_of(recording, time_s=0.02, view="1 sens", size=(400, 300))
+    assert alone.shape[0] < 300 and 380 < alone.shape[1] <= 400
+    middle = alone[100:150, 150:250].reshape(-1, 3).astype(int)
+    assert (np.abs(middle - palette.channels(DEPTH_COLOURS[0])[::-1]).max(axis=1) < 12).all()
+
+
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        ({"frame": 3}, r"--frame is 3; the frames of .* are 0\.\.2"),
+        ({"time_s": 9.0}, r"--time is 9; the times of .* are 0\.\.0\.5"),
+        ({"view": "7"}, r"--view is '7'; there are: 1 Sensor, In space\."),
+    ],
+)
+def test_a_picture_of_what_is_not_there_is_refused(
+    asked: dict[str, Any], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spans = [SimpleNamespace(name="frame", start=0, end=2), SimpleNamespace(name="time", start=0, end=500_000_000)]
+    views = [SimpleNamespace(name=name, view_class="2D") for name in ("In space", "1 Sensor", "Stages, ms: lines")]
+    shown = SimpleNamespace(store_id="it", timelines=spans)
+    state = SimpleNamespace(recordings=[shown], active_recording="it", loading=[], views=views)
+    client = SimpleNamespace(open=lambda path: None, get_state=lambda: state)
+    monkeypatch.setattr("rerun.experimental.ViewerClient.connect", lambda url: client)
+    nobody = SimpleNamespace(wait=lambda: 0, kill=lambda: None)
+    monkeypatch.setitem(screenshot.__globals__, "start", lambda *args, **more: (nobody, True))
+    (tmp_path / "a.rrd").write_bytes(b"RRF2")
+    with pytest.raises(UsageError, match=sentence):
+        screenshot(tmp_path / "a.rrd", **asked)
 
 
 def test_a_picture_of_a_recording_that_holds_nothing_is_refused(tmp_path: Path) -> None:
