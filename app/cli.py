@@ -21,7 +21,7 @@ from selective_depth.app.settings import (
     Limit,
     LiveSettings,
     Natural,
-    PictureOptions,
+    PanelOptions,
     PlayOptions,
     Positive,
     SelectorOptions,
@@ -47,9 +47,9 @@ EXAMPLES = (
 Options = Annotated[Settings, arg(name="")]
 LiveOptions = Annotated[LiveSettings, arg(name="")]
 Acquiring = Annotated[AcquireOptions, arg(name="")]
-Page = Annotated[PictureOptions, arg(name="")]
+Page = Annotated[PanelOptions, arg(name="")]
 Selectors = Annotated[SelectorOptions, arg(name="")]
-DEFAULTS, LIVE, SELECTORS, PAGE, BATCH = Settings(), LiveSettings(), SelectorOptions(), PictureOptions(), BatchOptions()
+DEFAULTS, LIVE, SELECTORS, PAGE, BATCH = Settings(), LiveSettings(), SelectorOptions(), PanelOptions(), BatchOptions()
 MODEL, SHOWN, DEMO = AcquireOptions(budget=0.05, rounds=8), AcquireOptions(budget=0.05, rounds=4), DemoOptions()
 SCENES = ("virtual:workstation", "virtual:ball", "virtual:firehose")
 
@@ -332,6 +332,7 @@ def screenshot(
     (f"{PROGRAM} snapshot walk.oni --frame 30", "one frame, all panels, no viewer needed"),
     (f"{PROGRAM} snapshot virtual:workstation virtual:ball virtual:firehose", "the paper's Fig. 5"),
     (f"{PROGRAM} snapshot frames/ --budget 0.05 --out pictures", "with what was acquired"),
+    (f"{PROGRAM} snapshot walk.oni --out panels --format pdf --panel-width 3.5", "for a paper's column"),
 )
 def snapshot(
     sources: Annotated[tuple[str, ...], optional("SOURCE...")],
@@ -349,7 +350,7 @@ def snapshot(
     sources : tuple of str
         Recordings, folders or scenes, as for replay; one row of the sheet each.
     out : Path
-        Folder for the sheet and every panel as .png; or a picture, for the sheet alone.
+        Folder for the sheet and every panel; or a picture, for the sheet alone.
     frame : int
         Which frame of each source, from 0.
     selectors, acquire
@@ -390,7 +391,8 @@ def figure(
     sources : tuple of str
         As for replay; by default the three virtual scenes, of which 1 and 2 take the first.
     out : Path
-        The picture to make, .png, .webp, .pdf or .svg; by default figure-N.png.
+        The picture to make, .png, .webp, .pdf or .svg, or a folder for it and every panel; by
+        default figure-N.png.
     save : Path
         Write the trainings of figure 1 to a Rerun recording as well, by epoch.
     frame : int

@@ -93,6 +93,7 @@ WindowSize = Annotated[
     must_be("WIDTHxHEIGHT, each from 200 to 8,000 pixels", _window, lambda wh: all(200 <= n <= 8000 for n in wh)),
     arg(metavar="WxH", help_behavior_hint="(default: 1920x1080)"),
 ]
+Inches = Annotated[float, must_be("from 2 to 60 inches", float, lambda x: 2 <= x <= 60), arg(metavar="INCHES")]
 _SIZE = re.compile(r"\d+(\.\d+)?([kMGT]i?)?B|\d+(\.\d+)?%")
 Memory = Annotated[str, must_be("a size, such as 256MiB or 25%", str, _SIZE.fullmatch), arg(metavar="SIZE")]
 Scheduler = Annotated[str | None, optional("ADDRESS|FILE")]
@@ -265,8 +266,20 @@ class PictureOptions:
 
     dpi: Annotated[int, whole(10, 2400)] = 100
     """Pixels per inch."""
-    width: Annotated[float, must_be("from 2 to 60 inches", float, lambda x: 2 <= x <= 60), arg(metavar="INCHES")] = 16.0
+    width: Inches = 16.0
     """Width of the page in inches; type and lines grow with it."""
+
+
+@dataclass(frozen=True)
+class PanelOptions(PictureOptions):
+    """Pictures: of one that is named, the format is that of its ending, .png, .webp, .pdf or .svg."""
+
+    format: Literal["png", "webp", "pdf", "svg"] = "png"
+    """Format of those in a folder."""
+    panel_width: Inches = 5.3
+    """Width of a single panel with its title, colour bar and notes, in inches."""
+    bare: Flag = False
+    """Single panels without these: the pixels of the frame alone."""
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,13 @@ from selective_depth.app.archive import Batch, Job, engine
 from selective_depth.app.archive.batch import SUMMARY_FILE
 from selective_depth.app.archive.engine import Stream, dashboard
 from selective_depth.app.commands.model import save_depth, save_result
+from selective_depth.app.commands.snapshot import row_of
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, OK
 from selective_depth.app.console.output import make_folder, write_image
 from selective_depth.app.console.progress import FrameProgress
-from selective_depth.app.pictures import StillRow, contact_sheet, write_picture
+from selective_depth.app.pictures import contact_sheet, write_picture
 from selective_depth.app.pipeline import FrameResult, StageTimes, figures_of, say
 from selective_depth.app.pipeline.selecting import selector_of
 from selective_depth.app.settings import BatchOptions, Settings, ViewerOptions
@@ -82,8 +83,7 @@ class Keeping:
                 _save(folder / kind / name, kind, result)
             if result.frame.index in wanted:
                 title = f"{stem.name}, frame {result.frame.index}"
-                row = StillRow(title, result.frame, result.regions, result.improvement, result.acquisition)
-                write_picture(folder / "stills" / name, contact_sheet([row]))
+                write_picture(folder / "stills" / name, contact_sheet([row_of(result, title)]))
             if viewer is not None:
                 result.figures.update(figures_of(result))
                 viewer.show(result)

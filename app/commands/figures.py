@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,17 +16,13 @@ import numpy.typing as npt
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import check_output, write_output
-from selective_depth.app.pictures import Panel, sheet
+from selective_depth.app.pictures import Panel, Row
 from selective_depth.app.pictures.panels import backdrop, draw_kept_triangles, draw_nodes, shaded_panel, tinted
-from selective_depth.app.pictures.sheets import WIDTH_IN, Row
 from selective_depth.app.pipeline import open_and_tell, say
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.neural_gas import EdgeMetric, NeuralGasSelector, RegionSelection, delaunay_regions
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.seeds import SeedGrid
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 EPOCHS = (5, 10, 25, 40, 60, 100)
 """Training lengths of Fig. 1."""
@@ -100,11 +97,8 @@ def by_metric(chosen: RegionSelection) -> dict[EdgeMetric, RegionSelection]:
 
 
 def epochs_figure(
-    frame: DepthFrame,
-    seeds: SeedGrid,
-    trained: Sequence[tuple[int, dict[EdgeMetric, RegionSelection]]],
-    width_in: float = WIDTH_IN,
-) -> Figure:
+    frame: DepthFrame, seeds: SeedGrid, trained: Sequence[tuple[int, dict[EdgeMetric, RegionSelection]]]
+) -> list[Row]:
     """Fig. 1 of the paper: nodes and areas of interest after trainings of several lengths.
 
     Parameters
@@ -115,19 +109,20 @@ def epochs_figure(
         Its first scan.
     trained : sequence
         What `epoch_selections` yielded.
-    width_in : float, default 16
-        Width of the page in inches.
+
+    Returns
+    -------
+    list of Row
+        For `sheet`.
     """
     columns = [
         (f"{length} epochs", f"error {chosen['3d'].quantisation_error_mm:.1f} mm", chosen) for length, chosen in trained
     ]
     nodes = len(trained[0][1]["3d"].nodes_mm)
-    return _figure(frame, f"{len(seeds.uv):,} points, {nodes:,} nodes", columns, width_in)
+    return _figure(frame, f"{len(seeds.uv):,} points, {nodes:,} nodes", columns)
 
 
-def densities_figure(
-    frame: DepthFrame, sides: Sequence[int] = DENSITIES, epochs: int = 50, seed: int = 0, width_in: float = WIDTH_IN
-) -> Figure:
+def densities_figure(frame: DepthFrame, sides: Sequence[int] = DENSITIES, epochs: int = 50, seed: int = 0) -> list[Row]:
     """Fig. 2 of the paper: areas of interest from first scans of several densities.
 
     Nodes are as many per point as in Fig. 1.
@@ -142,8 +137,11 @@ def densities_figure(
         Training length, in the middle of the paper's best range.
     seed : int, default 0
         Seed of the random draws.
-    width_in : float, default 16
-        Width of the page in inches.
+
+    Returns
+    -------
+    list of Row
+        For `sheet`.
     """
     columns = []
     for side in sides:
@@ -151,28 +149,31 @@ def densities_figure(
         nodes = max(1, round(len(seeds.uv) * FIRST_NODES / FIRST_POINTS))
         chosen = by_metric(NeuralGasSelector(nodes, epochs, "exact", seed).select(seeds))
         columns.append((f"{side} × {side}", f"{len(seeds.uv):,} points, {nodes:,} nodes", chosen))
-    return _figure(frame, f"{epochs} epochs", columns, width_in)
+    return _figure(frame, f"{epochs} epochs", columns)
 
 
 def _figure(
-    frame: DepthFrame, note: str, columns: Sequence[tuple[str, str, dict[EdgeMetric, RegionSelection]]], width_in: float
-) -> Figure:
+    frame: DepthFrame, note: str, columns: Sequence[tuple[str, str, dict[EdgeMetric, RegionSelection]]]
+) -> list[Row]:
     """The object, then a column per training: nodes above, kept triangles by each metric below."""
     first = shaded_panel(frame, "Object", note)
+    short = {title: re.sub(r"\W+", "-", title) for title, _, _ in columns}
     nodes = [
-        Panel("nodes", title, backdrop(frame), note=words, overlay=partial(draw_nodes, regions=by["3d"]))
+        Panel(
+            f"nodes-{short[title]}", title, backdrop(frame), note=words, overlay=partial(draw_nodes, regions=by["3d"])
+        )
         for title, words, by in columns
-    ]
+    ]  # fmt: skip
     rows: list[Row] = [("Nodes of the neural gas", [first, *nodes])]
     for metric in METRICS:
         kept = [
-            Panel("kept", title, tinted(backdrop(frame), by[metric].mask),
+            Panel(f"kept-{metric}-{short[title]}", title, tinted(backdrop(frame), by[metric].mask),
                   note=f"{by[metric].mask.mean():.0%} of the frame",
                   overlay=partial(draw_kept_triangles, regions=by[metric]))
             for title, _, by in columns
         ]  # fmt: skip
         rows.append((f"Triangles kept: {_NAMES[metric]}", [None, *kept]))
-    return sheet(rows, width_in, legend=False)
+    return rows
 
 
 class TableRow(NamedTuple):

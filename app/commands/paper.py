@@ -7,15 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from selective_depth.app.commands import figures
-from selective_depth.app.commands.snapshot import nth_frame, short_name, snapshot
+from selective_depth.app.commands.snapshot import draw_snapshot, is_folder, nth_frame, short_name, tell_of, write_all
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.exit_codes import OK
-from selective_depth.app.console.output import check_output, check_picture
+from selective_depth.app.console.output import check_output
 from selective_depth.app.console.progress import waiting
-from selective_depth.app.pictures import sheet, write_picture
 from selective_depth.app.pictures.panels import depth_panel, shaded_panel
 from selective_depth.app.pipeline import say
-from selective_depth.app.settings import PictureOptions, Settings
+from selective_depth.app.settings import PanelOptions, Settings
 from selective_depth.selectors.improvement import ImprovementSelector
 from selective_depth.selectors.neural_gas import NeuralGasSelector
 from selective_depth.selectors.seeds import SeedGrid
@@ -30,7 +29,7 @@ def draw_figure(
     out: Path | None,
     frame: int,
     settings: Settings,
-    page: PictureOptions,
+    page: PanelOptions,
     save: Path | None = None,
 ) -> int:
     """Make a figure of the paper of some sources; returns the exit code.
@@ -43,31 +42,27 @@ def draw_figure(
         If it is of a format that cannot be made, or a source has no such frame.
     """
     path = out or Path(f"figure-{number}.png")
-    check_picture(path)
+    is_folder(path)  # refused before the work is done
     check_output(save)
     if number == 5:
-        with waiting("Running both selectors"):
-            snapshot(sources, frame, path, settings, page)
-        say(f"wrote {path}")
-        return OK
-    gas, trained = settings.gas, []
+        return draw_snapshot(sources, frame, path, settings, page)
+    gas, trained, stems = settings.gas, [], []
     frames = [nth_frame(uri, frame) for uri in (sources if number == 4 else sources[:1])]
     if number == 1:
         seeds = figures.object_seeds(frames[0], figures.FIRST_POINTS)
         with waiting(f"training {len(figures.EPOCHS)} times"):
             trained = list(figures.epoch_selections(seeds, figures.EPOCHS, figures.FIRST_NODES, gas.seed))
-        made = figures.epochs_figure(frames[0], seeds, trained, page.width)
+        rows = figures.epochs_figure(frames[0], seeds, trained)
     elif number == 2:
         with waiting(f"training {len(figures.DENSITIES)} times"):
-            made = figures.densities_figure(frames[0], figures.DENSITIES, gas.epochs, gas.seed, page.width)
+            rows = figures.densities_figure(frames[0], figures.DENSITIES, gas.epochs, gas.seed)
     else:
+        stems = [f"{short_name(uri)}-" for uri in sources]
         rows = [
-            (short_name(uri), (shaded_panel(shown), depth_panel(shown)))
-            for uri, shown in zip(sources, frames, strict=True)
+            (f"{stem[:-1]}, frame {frame}", (shaded_panel(shown), depth_panel(shown)))
+            for stem, shown in zip(stems, frames, strict=True)
         ]
-        made = sheet(rows, page.width, legend=False)
-    write_picture(path, made, page.dpi)
-    say(f"wrote {path}")
+    tell_of(write_all(path, f"figure-{number}", rows, stems or [""] * len(rows), page, legend=False))
     if save is not None and trained:
         from selective_depth.app.viewer import save_trainings
 

@@ -6,13 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import OK
-from selective_depth.app.console.output import IMAGES, PICTURES, check_picture, make_folder, write_image
+from selective_depth.app.console.output import IMAGES, check_picture, make_folder, write_image
 from selective_depth.app.console.progress import waiting
-from selective_depth.app.pictures import StillRow, alone, contact_sheet, panels_of, write_picture
-from selective_depth.app.pipeline import FrameResult, Pipeline, open_and_tell, say
-from selective_depth.app.settings import PictureOptions, Settings
+from selective_depth.app.pictures import Row, StillRow, alone, contact_rows, sheet, write_picture
+from selective_depth.app.pipeline import Even, FrameResult, Pipeline, open_and_tell, say
+from selective_depth.app.settings import PanelOptions, Settings
 from selective_depth.drivers.errors import SourceEndedError
 from selective_depth.drivers.frame import DepthFrame
 
@@ -51,11 +53,73 @@ def still_row(frame: DepthFrame, title: str, settings: Settings) -> StillRow:
 
 
 def row_of(result: FrameResult, title: str) -> StillRow:
-    """A frame's result as a row of a contact sheet."""
-    return StillRow(title, result.frame, result.regions, result.improvement, result.acquisition)
+    """A frame's result as a row of a contact sheet, an even lattice's model of the frame beside its own."""
+    frame, acquisition = result.frame, result.acquisition
+    if acquisition is None:
+        return StillRow(title, frame, result.regions, result.improvement)
+    selective_mm = acquisition.reconstruct() if result.model is None else result.model.depth_mm
+    models = (("even", Even.of(frame, len(acquisition.uv)).depth_mm), ("selective", selective_mm))
+    exact = None
+    if result.memory is not None and frame.truth_mm is not None:
+        exact = replace(frame, depth_mm=np.where(frame.depth_mm > 0, frame.truth_mm, np.uint16(0)))
+    return StillRow(title, frame, result.regions, result.improvement, acquisition, models, exact)
 
 
-def snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings, page: PictureOptions) -> list[Path]:
+def is_folder(out: Path) -> bool:
+    """Whether pictures go into a folder of that name, which is made if need be, or are one file.
+
+    Raises
+    ------
+    UsageError
+        If it names a picture of a format that cannot be made.
+    OutputError
+        If the folder cannot be made, or that of the picture does not exist.
+    """
+    folder = out.is_dir() or not out.suffix
+    if folder:
+        make_folder(out)
+    else:
+        check_picture(out)
+    return folder
+
+
+def write_all(
+    out: Path, name: str, rows: Sequence[Row], stems: Sequence[str], page: PanelOptions, *, legend: bool = True
+) -> list[Path]:
+    """Write a sheet; into a folder, with every panel of it alone beside it.
+
+    Parameters
+    ----------
+    out : Path
+        A picture, or a folder, as `is_folder` says.
+    name : str
+        Name of the sheet in a folder, without its ending.
+    rows : sequence of Row
+        As for `sheet`.
+    stems : sequence of str
+        What the names of each row's panels begin with.
+    page : PanelOptions
+        Size, resolution, and in a folder format.
+    legend : bool, default True
+        As for `sheet`.
+
+    Returns
+    -------
+    list of Path
+        What was written, the sheet first.
+    """
+    folder = is_folder(out)
+    written = [out / f"{name}.{page.format}" if folder else out]
+    write_picture(written[0], sheet(rows, page.width, legend=legend), page.dpi)
+    for stem, (title, panels) in zip(stems, rows if folder else (), strict=folder):
+        for panel in filter(None, panels):
+            written.append(out / f"{stem}{panel.name}.{page.format}")
+            figure = alone(panel) if page.bare else sheet([(title, [panel])], page.panel_width, legend=legend)
+            write_picture(written[-1], figure, page.dpi)
+    return written
+
+
+def snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings, page: PanelOptions) -> list[Path]:
     """Write a contact sheet with a row per source, and each panel alone.
 
     Parameters
@@ -68,8 +132,8 @@ def snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings,
         A picture, for the sheet alone; or a folder for the sheet and the panels, made if need be.
     settings : Settings
         Options of the seeds, the selectors and the acquisition.
-    page : PictureOptions
-        Size of the sheet, and resolution of both.
+    page : PanelOptions
+        Size, resolution and format.
 
     Returns
     -------
@@ -79,39 +143,35 @@ def snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings,
     Raises
     ------
     UsageError
-        If there is no source, or one has no such frame.
+        If there is no source, one has no such frame, or a picture's format is not known.
     OutputError
         If the folder or a picture cannot be written.
     """
     if not sources:
         raise UsageError("no source was named; give recordings, folders or scenes.")
-    single = out.suffix.lower() in PICTURES
-    if single:
-        check_picture(out)
-    else:
-        make_folder(out)
+    is_folder(out)  # refused before the work is done
     names = [short_name(uri) for uri in sources]
-    rows = []
+    stems, rows = [], []
     for at, (uri, name) in enumerate(zip(sources, names, strict=True)):
         again = names[:at].count(name)
-        title = f"{name}-{again + 1}" if again else name
-        rows.append(still_row(nth_frame(uri, number), title, settings))
-    written = [out if single else out / "sheet.png"]
-    write_picture(written[0], contact_sheet(rows, page.width), page.dpi)
-    for row in () if single else rows:
-        for panel in panels_of(row):
-            written.append(out / f"{row.title}-{panel.name}.png")
-            write_picture(written[-1], alone(panel), page.dpi)
-    return written
+        stems.append(f"{name}-{again + 1}-" if again else f"{name}-")
+        frame = nth_frame(uri, number)
+        rows.append(still_row(frame, f"{stems[-1][:-1]}, frame {number}", settings))
+    return write_all(out, "sheet", contact_rows(rows), stems, page)
 
 
-def draw_snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings, page: PictureOptions) -> int:
+def draw_snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings, page: PanelOptions) -> int:
     """Make a `snapshot` and say what was written; returns the exit code."""
     with waiting("Running both selectors"):
         written = snapshot(sources, number, out, settings, page)
+    tell_of(written)
+    return OK
+
+
+def tell_of(written: Sequence[Path]) -> None:
+    """Say what `write_all` wrote."""
     beside = f" and {len(written) - 1} single panels beside it" if written[1:] else ""
     say(f"wrote {written[0]}{beside}")
-    return OK
 
 
 def take_screenshot(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -23,13 +23,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StillRow:
-    """One source of a contact sheet: what was seen and what each method made of it."""
+    """One source of a contact sheet: what was seen and what each method made of it.
+
+    Parameters
+    ----------
+    title : str
+        Above the row.
+    frame, regions, improvement, acquisition
+        What was seen, selected and, with a budget, measured.
+    models : sequence of (str, float32 array of shape (height, width))
+        Dense models in millimetres, by name, whose errors are shown.
+    exact : DepthFrame or None
+        What they are held against; by default the frame.
+    """
 
     title: str
     frame: DepthFrame
     regions: RegionSelection
     improvement: ImprovementSelection
     acquisition: Acquisition | None = None
+    models: Sequence[tuple[str, npt.NDArray[np.float32]]] = ()
+    exact: DepthFrame | None = None
 
 
 @dataclass(frozen=True)
@@ -50,6 +64,8 @@ class Panel:
         Below it.
     overlay : callable or None
         Draws on the axes, in pixels of the frame, what is finer than these.
+    marks : tuple of str, default ("hole",)
+        What of `sheets.MARKS` a legend has to explain.
     """
 
     name: str
@@ -58,6 +74,7 @@ class Panel:
     scale: Scale | None = None
     note: str = ""
     overlay: Callable[[Axes], None] | None = None
+    marks: tuple[str, ...] = ("hole",)
 
 
 def with_holes(image: Image, hole: npt.NDArray[np.bool_]) -> Image:
@@ -95,7 +112,8 @@ def scene_panel(frame: DepthFrame) -> Panel | None:
         return None
     height, width = frame.shape
     image = cv2.resize(frame.colour, (width, height), interpolation=cv2.INTER_AREA)
-    return Panel("scene", "Scene", np.asarray(image), note="" if frame.registered else "not registered to depth")
+    return Panel("scene", "Scene", np.asarray(image), note="" if frame.registered else "not registered to depth",
+                 marks=())  # fmt: skip
 
 
 def shaded_panel(frame: DepthFrame, caption: str = "Scene", note: str = "") -> Panel:
@@ -143,7 +161,7 @@ def regions_panel(frame: DepthFrame, regions: RegionSelection) -> Panel:
 
     image = tinted(backdrop(frame), regions.mask)
     note = f"{len(regions.nodes_uv):,} nodes, {regions.mask.mean():.0%} kept"
-    return Panel("neural-gas", "Neural gas regions", image, note=note, overlay=overlay)
+    return Panel("neural-gas", "Neural gas regions", image, note=note, overlay=overlay, marks=("hole", "kept", "node"))
 
 
 def improvement_panel(improvement: ImprovementSelection) -> Panel:
@@ -152,32 +170,33 @@ def improvement_panel(improvement: ImprovementSelection) -> Panel:
     return Panel("improvement", "Improvement map", image, palette.IMPROVEMENT, "eq. (23)")
 
 
-def shots_panel(frame: DepthFrame, uv: npt.NDArray[np.integer], rounds: npt.NDArray[np.integer], caption: str) -> Panel:
+def shots_panel(
+    frame: DepthFrame, uv: npt.NDArray[np.integer], rounds: npt.NDArray[np.integer], caption: str, note: str = ""
+) -> Panel:
     """Where measurements were taken, by round; those of round 0, the seeds, are not drawn."""
     image = backdrop(frame)
     last = max(int(rounds.max(initial=1)), 1)
     taken = rounds > 0
     colours = palette.channels(palette.round_colours(last))
     image[uv[taken, 1], uv[taken, 0]] = colours[rounds[taken].astype(int)]
-    scale = Scale("acquired in", palette.ROUND_COLOURMAP, (1, last), "round") if last > 1 else None
-    return Panel("acquired", caption, image, scale)
+    return Panel("acquired", caption, image, palette.round_scale(last) if last > 1 else None, note)
 
 
 def samples_panel(frame: DepthFrame, acquisition: Acquisition) -> Panel:
     """Where the budget went, by round."""
     share = float((acquisition.round > 0).sum()) / frame.depth_mm.size
-    caption = f"{share:.1%} more by {acquisition.by}"
-    return shots_panel(frame, acquisition.uv, acquisition.round, caption)
+    by = acquisition.by.removesuffix(", with memory")
+    return shots_panel(frame, acquisition.uv, acquisition.round, f"By {by}", f"{share:.1%} of the pixels, by round")
 
 
-def error_panel(frame: DepthFrame, model_mm: npt.NDArray[np.float32], caption: str) -> Panel:
+def error_panel(frame: DepthFrame, model_mm: npt.NDArray[np.float32], caption: str, name: str = "error") -> Panel:
     """How far a model, in millimetres, is from the full frame."""
     hole = frame.depth_mm == 0
     error_mm = np.abs(model_mm - frame.depth_mm.astype(np.float32))
     image = with_holes(palette.ERROR.colour(error_mm), hole)
     known = error_mm[~hole] if not hole.all() else np.zeros(1)
     note = f"RMSE {np.sqrt(np.mean(known**2)):.1f}, MAE {np.mean(known):.1f} mm"
-    return Panel("error", caption, image, palette.ERROR, note)
+    return Panel(name, caption, image, palette.ERROR, note)
 
 
 def panels_of(row: StillRow) -> list[Panel]:
@@ -187,7 +206,8 @@ def panels_of(row: StillRow) -> list[Panel]:
     shown += [depth_panel(row.frame), regions_panel(row.frame, row.regions), improvement_panel(row.improvement)]
     if row.acquisition is not None:
         shown.append(samples_panel(row.frame, row.acquisition))
-        shown.append(error_panel(row.frame, row.acquisition.reconstruct(), "Model error"))
+    for name, model_mm in row.models:
+        shown.append(error_panel(row.exact or row.frame, model_mm, f"Error, {name}", f"error-{name}"))
     return shown
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,20 +33,17 @@ Row = tuple[str, Sequence[Panel | None]]
 """A title, and panels from left to right; None leaves a place empty."""
 
 
-def contact_sheet(rows: Sequence[StillRow], width_in: float = WIDTH_IN) -> Figure:
-    """All sources under each other, like Fig. 5 of the paper.
-
-    Parameters
-    ----------
-    rows : sequence of StillRow
-        At least one.
-    width_in : float, default 16
-        Width of the page in inches.
-    """
+def contact_rows(rows: Sequence[StillRow]) -> list[Row]:
+    """All sources under each other, like Fig. 5 of the paper; at least one."""
     coloured = any(row.frame.colour is not None for row in rows)
     # Where one row has a scene, one without keeps its place: columns stay what they are.
     gaps = [[None] * (coloured and row.frame.colour is None) for row in rows]
-    return sheet([(row.title, [*gap, *panels_of(row)]) for row, gap in zip(rows, gaps, strict=True)], width_in)
+    return [(row.title, [*gap, *panels_of(row)]) for row, gap in zip(rows, gaps, strict=True)]
+
+
+def contact_sheet(rows: Sequence[StillRow], width_in: float = WIDTH_IN) -> Figure:
+    """A `sheet` of `contact_rows`."""
+    return sheet(contact_rows(rows), width_in)
 
 
 def sheet(rows: Sequence[Row], width_in: float = WIDTH_IN, *, legend: bool = True) -> Figure:
@@ -70,29 +67,31 @@ def sheet(rows: Sequence[Row], width_in: float = WIDTH_IN, *, legend: bool = Tru
     from matplotlib.figure import Figure
 
     columns = max(len(shown) for _, shown in rows)
-    each = (WIDTH_IN - _GAP * (columns + 1)) / columns
+    page_in = WIDTH_IN * min(columns / 3, 1)  # what sizes are for: fewer panels are no larger, but the type is
+    each = (page_in - _GAP * (columns + 1)) / columns
     heights = [max(each * p.image.shape[0] / p.image.shape[1] for p in shown if p) for _, shown in rows]
     extras = [(_TITLE if title else 0.0) + _CAPTION + _FOOT for title, _ in rows]
     height = sum(heights) + sum(extras) + _GAP + _LEGEND * legend
-    zoom = width_in / WIDTH_IN
+    zoom = width_in / page_in
     with rc_context({"text.parse_math": False}):  # a source may be called $x
         figure = Figure(figsize=(width_in, height * zoom), facecolor="white")
         top = height - _GAP / 2
         for (title, shown), tall, extra in zip(rows, heights, extras, strict=True):
             if title:
-                place = (_GAP / WIDTH_IN, (top - 0.32) / height)
+                place = (_GAP / page_in, (top - 0.32) / height)
                 figure.text(*place, _told(title), size=17 * zoom, weight="bold", color=INK)
             bottom = top - extra - tall + _FOOT
             for column, panel in enumerate(shown):
                 if panel is not None:
                     left = _GAP + column * (each + _GAP)
-                    box = (left / WIDTH_IN, bottom / height, each / WIDTH_IN, tall / height)
+                    box = (left / page_in, bottom / height, each / page_in, tall / height)
                     axes = figure.add_axes(box)
                     _fill(axes, panel, zoom)
                     _caption(axes, panel, each, tall, zoom)
             top -= extra + tall
         if legend:
-            _explain(figure, height, zoom)
+            marks = {mark for _, panels in rows for panel in panels if panel for mark in panel.marks}
+            _explain(figure, marks, page_in, height, zoom)
     return figure
 
 
@@ -117,19 +116,26 @@ def write_picture(path: Path, figure: Figure, dpi: int = DPI) -> None:
     figure : Figure
         What `sheet` or `alone` made.
     dpi : int, default 100
-        Pixels per inch; in PDF and SVG those of the images in it.
+        Pixels per inch. PDF and SVG hold the pixels of the frame, however large they are shown.
 
     Raises
     ------
     OutputError
         If it cannot be written; an older file of that name stays as it was.
     """
+    from matplotlib import rc_context
+    from matplotlib.image import AxesImage
+
     kind = path.suffix.lower().removeprefix(".")
     drawn = io.BytesIO()
     more: dict[str, Any] = {}
     if kind == "webp":
         more = {"pil_kwargs": {"quality": _WEBP_QUALITY}}
-    with warnings.catch_warnings():
+    if kind in ("pdf", "svg"):
+        for image in figure.findobj(AxesImage):
+            image.set_interpolation("none")
+    # Journals refuse PDF's fonts of type 3, matplotlib's usual ones.
+    with warnings.catch_warnings(), rc_context({"pdf.fonttype": 42}):
         warnings.simplefilter("ignore")  # a letter of some source's name that no font has
         figure.savefig(drawn, format=kind, dpi=dpi, **more)
     write_output(path, drawn.getvalue())
@@ -147,23 +153,21 @@ def _fill(axes: Axes, panel: Panel, zoom: float) -> None:
 
 def _caption(axes: Axes, panel: Panel, each: float, tall: float, zoom: float) -> None:
     """Write a panel's caption above it; draw its colour bar, with ticks, and its note below."""
-    large, small = (13, 10) if each >= 3.5 else (11.5, 9) if each >= 2.6 else (10, 8)
+    large, small = (13, 10) if each >= 3.5 else (11.5, 9) if each >= 2.6 else (10, 8) if each >= 2.2 else (9, 7)
     axes.text(0, 1 + 0.09 / tall, _told(panel.caption), transform=axes.transAxes,
               size=large * zoom, weight="bold", color=INK)  # fmt: skip
     below: dict[str, Any] = {"transform": axes.transAxes, "size": small * zoom, "color": PALE}
     axes.text(1, -0.2 / tall, panel.note, ha="right", **below)
     if panel.scale is None:
         return
-    (low, high), unit = panel.scale.limits, panel.scale.unit
-    colours = palette.round_colours(round(high))[1:] if unit == "round" else palette.palette(panel.scale.colormap)
     bar = axes.inset_axes((0, -0.18 / tall, _BAR, 0.1 / tall))
-    bar.imshow(palette.channels(colours)[None], aspect="auto")
+    bar.imshow(panel.scale.bar[None], aspect="auto")
     bar.set_axis_off()
-    for text, at, side in ((f"{low:g}", 0, "left"), (unit, 0.5, "center"), (f"{high:g}", 1, "right")):
-        axes.text(at * _BAR, -0.34 / tall, text, ha=side, **below)
+    for at, text in panel.scale.ticks:
+        axes.text(at * _BAR, -0.34 / tall, text, ha="center" if at else "left", **below)
 
 
-def _explain(figure: Figure, height: float, zoom: float) -> None:
+def _explain(figure: Figure, shown: Container[str], page_in: float, height: float, zoom: float) -> None:
     """Explain the marks that carry no scale of their own."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -171,14 +175,15 @@ def _explain(figure: Figure, height: float, zoom: float) -> None:
     node = Line2D([], [], marker="o", linestyle="", markersize=4 * zoom, color="white",
                   markeredgecolor=PALE, markeredgewidth=0.6 * zoom)  # fmt: skip
     marks = {
-        palette.UNKNOWN: Patch(color=hexadecimal(palette.HOLE)),
-        "kept triangles (edges ≤ mean)": Patch(color=hexadecimal(palette.REGION | 0xFF)),
-        "neural-gas node": node,
+        "hole": (palette.UNKNOWN, Patch(color=hexadecimal(palette.HOLE))),
+        "kept": ("kept triangles", Patch(color=hexadecimal(palette.REGION | 0xFF))),
+        "node": ("neural-gas node", node),
     }
+    told = dict(mark for name, mark in marks.items() if name in shown)
     figure.legend(
-        list(marks.values()), list(marks), loc="lower left", ncols=3, frameon=False,
-        bbox_to_anchor=(_GAP / WIDTH_IN, 0.06 / height), borderpad=0, borderaxespad=0,
-        fontsize=10 * zoom, labelcolor=PALE, handlelength=1.6, columnspacing=2.2,
+        list(told.values()), list(told), loc="lower left", ncols=3, frameon=False,
+        bbox_to_anchor=(_GAP / page_in, 0.06 / height), borderpad=0, borderaxespad=0,
+        fontsize=10 * zoom, labelcolor=PALE, handlelength=1.2, columnspacing=1.4,
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from rerun.chunk import RrdReader
 
 from selective_depth.app import cli
 from selective_depth.app.commands import figures
-from selective_depth.app.pictures import palette, write_picture
+from selective_depth.app.pictures import palette, sheet, write_picture
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.selectors.seeds import SeedGrid
 
@@ -53,7 +53,7 @@ def test_figure_has_a_column_per_training_and_shows_its_nodes_and_regions(tmp_pa
     frame = ball()
     seeds = SeedGrid.from_frame(frame, (40, 40))
     trained = list(figures.epoch_selections(seeds, (1, 3, 5), nodes=80))
-    write_picture(tmp_path / "a.png", figures.epochs_figure(frame, seeds, trained))
+    write_picture(tmp_path / "a.png", sheet(figures.epochs_figure(frame, seeds, trained), legend=False))
     picture = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png")), cv2.COLOR_BGR2RGB).astype(int)
     rows = np.array_split(picture, 3)
     teal = palette.channels(palette.REGION).astype(int)
@@ -112,6 +112,14 @@ def test_each_figure_of_the_paper_has_a_command(number: str, small, tmp_path: Pa
     assert cli.run([*words, "--gas.epochs", "2", "--dpi", "40"]) == 0
     picture = cv2.imread(str(out))
     assert picture is not None and picture.std() > 10
+
+
+def test_a_figure_into_a_folder_has_every_panel_beside_it(small, tmp_path: Path):
+    words = ["figure", "1", OBJECT, "--out", str(tmp_path / "new"), "--format", "svg", "--panel-width", "3"]
+    assert cli.run(words) == 0
+    names = {path.name for path in (tmp_path / "new").iterdir()}
+    trained = {f"{what}-{length}-epochs.svg" for what in ("nodes", "kept-3d", "kept-image") for length in (1, 2)}
+    assert names == {"figure-1.svg", "shaded.svg", *trained}
 
 
 def test_the_table_of_the_paper_shows_our_times_beside_the_papers(capsys):

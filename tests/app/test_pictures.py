@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import pytest
 
-from selective_depth.app.commands.snapshot import short_name, snapshot, still_row
+from selective_depth.app.commands.snapshot import row_of, short_name, snapshot, still_row
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pictures import StillRow, contact_sheet, palette, write_picture
 from selective_depth.app.pictures import panels as parts
+from selective_depth.app.pictures import sheet as parts_sheet
 from selective_depth.app.pictures.palette import Scale
-from selective_depth.app.settings import AcquireOptions, GasOptions, PictureOptions, Settings
+from selective_depth.app.pipeline import Pipeline
+from selective_depth.app.settings import AcquireOptions, GasOptions, PanelOptions, Settings
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.folder import write_folder
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.open import open_source
+from selective_depth.selectors.even import even_lattice
+from selective_depth.selectors.reconstruct import reconstruct
 
-PAGE = PictureOptions()
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PAGE = PanelOptions()
+REMEMBERING = Settings(gas=GasOptions(nodes=300), acquire=AcquireOptions(budget=0.03, memory="still"))
 SMALL = Settings(gas=GasOptions(nodes=300), acquire=AcquireOptions(budget=0.02, rounds=2))
 
 
@@ -43,7 +53,7 @@ def hexadecimal(colour: int) -> tuple[int, ...]:
 
 def test_every_panel_has_the_size_of_the_frame(row: StillRow) -> None:
     made = parts.panels_of(row)
-    names = ["depth", "neural-gas", "improvement", "acquired", "error"]
+    names = ["depth", "neural-gas", "improvement", "acquired", "error-even", "error-selective"]
     assert [panel.name for panel in made] == names
     for panel in made:
         assert panel.image.shape == (240, 320, 3)
@@ -117,24 +127,61 @@ def test_a_frame_without_depth_can_be_drawn(tmp_path: Path) -> None:
     assert sheet is not None and sheet.shape[1] == 1600
 
 
-@pytest.mark.parametrize("columns", [3, 5])
-def test_no_text_leaves_the_page_or_runs_into_another(columns: int, row: StillRow) -> None:
+def drawings(row: StillRow) -> dict[str, Figure]:
+    """Sheets with few and many panels, and every panel alone."""
+    scene = np.zeros((*row.frame.shape, 3), np.uint8)
+    coloured = replace(row, frame=replace(row.frame, colour=scene, registered=True), title="walk.oni, frame 12")
+    few = replace(row, acquisition=None, models=())
+    alone = {panel.name: parts_sheet([(coloured.title, [panel])], 5.3) for panel in parts.panels_of(coloured)}
+    return {"few": contact_sheet([few]), "many": contact_sheet([coloured]), **alone}
+
+
+def test_no_text_leaves_the_page_or_runs_into_another(row: StillRow) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.text import Text
 
-    sheet = contact_sheet([row if columns == 5 else replace(row, acquisition=None)])
-    canvas = FigureCanvasAgg(sheet)
-    canvas.draw()
-    renderer = canvas.get_renderer()
-    texts = [text for text in sheet.findobj(Text) if text.get_text() and text.get_visible()]
-    texts = [text for text in texts if text.axes is None or text in text.axes.texts]
-    boxes = [text.get_window_extent(renderer) for text in texts]
-    assert len(boxes) > 2 * columns
-    for at, box in enumerate(boxes):
-        assert box.x0 >= 0 and box.y0 >= 0, texts[at]
-        assert box.x1 <= sheet.bbox.x1 and box.y1 <= sheet.bbox.y1, texts[at]
-        for other in range(at):
-            assert not box.overlaps(boxes[other]), (texts[at], texts[other])
+    drawn = drawings(row)
+    assert len(drawn) == 9
+    for name, figure in drawn.items():
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        renderer = canvas.get_renderer()
+        texts = [text for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
+        texts = [text for text in texts if text.axes is None or text in text.axes.texts]
+        boxes = [text.get_window_extent(renderer) for text in texts]
+        assert len(boxes) >= 2, name
+        for at, box in enumerate(boxes):
+            assert box.x0 >= 0 and box.y0 >= 0, (name, texts[at])
+            assert box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1, (name, texts[at])
+            for other in range(at):
+                assert not box.overlaps(boxes[other]), (name, texts[at], texts[other])
+
+
+def test_errors_are_those_of_as_many_measurements_spread_evenly_and_by_selection(row: StillRow) -> None:
+    assert row.acquisition is not None
+    even, selective = parts.panels_of(row)[-2:]
+    assert even.scale is selective.scale is palette.ERROR
+    frame, count = row.frame, len(row.acquisition.uv)
+    uv = even_lattice(frame.shape, count)
+    assert len(uv) == pytest.approx(count, rel=0.02)
+    for panel, model_mm in (
+        (even, reconstruct(uv, frame.measure(uv), frame.shape)),
+        (selective, row.acquisition.reconstruct()),
+    ):
+        off = (model_mm - frame.depth_mm)[frame.depth_mm > 0]
+        assert f"RMSE {np.sqrt(np.mean(off**2)):.1f}" in panel.note
+
+
+def test_with_a_memory_the_model_and_the_truth_are_the_memorys() -> None:
+    with open_source("virtual:ball?size=320x240&speed=0&frames=4") as source, Pipeline(REMEMBERING) as pipeline:
+        results = [pipeline.make(frame) for frame in source]
+    row = row_of(results[-1], "still")
+    truth_mm, model = results[-1].frame.truth_mm, results[-1].model
+    assert truth_mm is not None and model is not None
+    seen = (results[-1].frame.depth_mm > 0) & (truth_mm > 0)
+    rmse_mm = np.sqrt(np.mean((model.depth_mm - truth_mm)[seen] ** 2))
+    assert f"RMSE {rmse_mm:.1f}," in parts.panels_of(row)[-1].note
+    assert model.truth_rmse_mm == pytest.approx(rmse_mm, rel=1e-4)
 
 
 def test_the_ending_is_the_format_and_size_and_resolution_are_as_asked(row: StillRow, tmp_path: Path) -> None:
@@ -152,7 +199,7 @@ def test_snapshots_of_one_name_and_of_strange_names_are_all_written(tmp_path: Pa
     with open_source("virtual:ball?size=320x240&frames=1") as source:
         write_folder(frames, source)
     written = snapshot([str(frames), str(frames)], 0, tmp_path / "out", SMALL, PAGE)
-    assert len(written) == 1 + 2 * 6
+    assert len(written) == 1 + 2 * 7
     assert set(written) == set((tmp_path / "out").iterdir())
 
 
@@ -160,12 +207,48 @@ def test_snapshot_writes_the_sheet_and_every_panel(tmp_path: Path) -> None:
     sources = ["virtual:ball?size=320x240&frames=2", "virtual:workstation?size=320x240&frames=2"]
     written = snapshot(sources, 1, tmp_path / "new" / "pictures", SMALL, PAGE)
     assert [path.name for path in written[:3]] == ["sheet.png", "ball-scene.png", "ball-depth.png"]
-    assert len(written) == 1 + 2 * 6
+    assert len(written) == 1 + 2 * 7
     sheet = cv2.imread(str(written[0]))
     assert sheet is not None and sheet.shape[1] == 1600
     for path in written[1:]:
         single = cv2.imread(str(path))
+        assert single is not None and single.shape[1] == 530
+
+
+def test_bare_panels_are_the_pixels_of_the_frame(tmp_path: Path) -> None:
+    written = snapshot(["virtual:ball?size=320x240"], 0, tmp_path, SMALL, PanelOptions(bare=True, format="webp"))
+    assert {path.suffix for path in written} == {".webp"}
+    for path in written[1:]:
+        single = cv2.imread(str(path))
         assert single is not None and single.shape == (240, 320, 3)
+
+
+def test_panels_for_a_paper_are_as_wide_as_asked_and_hold_every_pixel(tmp_path: Path) -> None:
+    page = PanelOptions(format="pdf", panel_width=3.5)
+    written = snapshot(["virtual:ball?size=320x240"], 0, tmp_path / "new", SMALL, page)
+    for path in written[1:]:
+        pdf = path.read_bytes()
+        assert re.search(rb"/MediaBox \[ *0 0 252 ", pdf), path  # 3.5 inches in points
+        assert b"/Width 320" in pdf and b"/Height 240" in pdf
+        assert b"/Type3" not in pdf  # which journals refuse
+
+
+def test_a_row_says_which_frame_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    titles: list[str] = []
+    plain = parts_sheet
+
+    def noting(rows, *more, **options):
+        titles.extend(title for title, _ in rows)
+        return plain(rows, *more, **options)
+
+    monkeypatch.setattr("selective_depth.app.commands.snapshot.sheet", noting)
+    snapshot(["virtual:ball?size=320x240&frames=3"], 2, tmp_path / "a.svg", SMALL, PAGE)
+    assert titles == ["ball, frame 2"]
+
+
+def test_a_format_that_cannot_be_made_is_refused_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"must end in \.png, \.webp, \.pdf or \.svg"):
+        snapshot(["virtual:ball"], 0, tmp_path / "a.gif", SMALL, PAGE)
 
 
 def test_an_out_that_ends_like_a_picture_is_the_sheet_alone(tmp_path: Path) -> None:
