@@ -294,7 +294,7 @@ def model(
     "Pictures",
     (f"{PROGRAM} screenshot out.rrd out.png", "the viewer on a recording that --save wrote"),
     (f"{PROGRAM} screenshot out.rrd out.png --time 12.5 --size 1280x720", "after so many seconds"),
-    (f"{PROGRAM} screenshot out.rrd space.png --view 'In space'", "one view alone"),
+    (f"{PROGRAM} screenshot out.rrd space.png --view space", "one view alone"),
 )
 def screenshot(
     recording: Annotated[Path, arg(metavar="FILE.rrd")],
@@ -318,7 +318,7 @@ def screenshot(
     time : float
         Show the time so many seconds after the first frame instead.
     view : str
-        Show one view alone: its title, or the beginning of it.
+        Show one view alone: its title, or a part of it.
     size : tuple of int
         Width and height of the viewer in pixels.
     """

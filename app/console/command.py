@@ -25,30 +25,40 @@ import functools
 import inspect
 import io
 import re
+import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, make_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.settings_file import preset_arguments, settings_arguments
 
 PROGRAM = "selective-depth"
-SHELLS = ("bash", "zsh")
-SOURCE_OPTIONS = ("scale", "camera", "mode", "topic", "stream", "colour")
-"""Options of sources, which every command that opens one takes as ``--NAME VALUE``."""
-_SOURCE_HELP = (
-    "With any command that takes a SOURCE or DEVICE, for what it does not say of itself:",
-    "  --scale N            values per metre of a folder's images, as 1000 or 5000",
-    "  --camera FX,FY,CX,CY intrinsics in pixels",
-    "  --mode 640x480@30    of a sensor",
-    "  --topic NAME         of a ROS bag",
-    "  --stream N           which depth stream of an .oni file, from 1",
-    "  --colour WORD        off; registered or unregistered, as it lies on depth; or the colour",
-    "                       camera as FX,FY,CX,CY,X,Y,Z, its place in mm beside that of depth",
-)
+SHELLS = ("bash", "zsh", "fish")
+SOURCE_OPTIONS = {
+    "scale": ("N", "values per metre of a folder's images, as 1000 or 5000"),
+    "camera": ("FX,FY,CX,CY", "intrinsics in pixels"),
+    "mode": ("640x480@30", "of a sensor"),
+    "topic": ("NAME", "of a ROS bag"),
+    "stream": ("N", "which depth stream of an .oni file, from 1"),
+    "colour": ("WORD", "off; registered or unregistered, as it lies on depth; or the colour camera as"
+               " FX,FY,CX,CY,X,Y,Z, its place in mm beside that of depth"),
+}  # fmt: skip
+"""Options of sources, which every command that opens one takes as ``--NAME VALUE``: what the value is, and means."""
+_OPTIONS = {
+    "settings": ("FILE", "take options from a TOML file; the command line wins"),
+    "preset": ("paper", "take the options that the paper's section V was made with"),
+}
+_SWITCHES = {"verbose": "say more", "debug": "show the traceback of an error"}
+"""What every command takes."""
 SOURCES = ("source", "sources", "device", "paths")
 """Parameters of commands that name what `open_source` opens; the last of the paths is where it goes."""
+FISH_FILES = f"""
+complete --command {PROGRAM} --force-files --condition 'set -l typed (commandline -opc); \
+test (count $typed) -gt 1; and not string match -q -- "-*" $typed[-1] (commandline -ct)'
+"""
+"""Files are what a command takes but for its options: fish is told none by the parser."""
 Run = Callable[..., int | None]
 Example = tuple[str, str]
 
@@ -88,7 +98,7 @@ class Command:
         summary, _, rest = text.partition("\n")
         lines = [summary, "", "Examples:", *_example_lines(self.examples), *rest.rstrip().split("\n")]
         if set(SOURCES) & set(inspect.signature(self.run).parameters):
-            lines += ["", *_SOURCE_HELP]
+            lines += ["", *_source_help()]
         return "\n".join(lines)
 
 
@@ -113,6 +123,15 @@ def _example_lines(examples: Sequence[Example]) -> list[str]:
     return [f"  {line:{width}}  {what}" for line, what in examples]
 
 
+def _source_help() -> list[str]:
+    lines = ["With any command that takes a SOURCE or DEVICE, for what it does not say of itself:"]
+    for name, (value, told) in SOURCE_OPTIONS.items():
+        first = f"  --{name} {value}".ljust(23)
+        lines += textwrap.wrap(told, 97, initial_indent=f"{first} " if len(first) > 23 else first,
+                               subsequent_indent=" " * 23)  # fmt: skip
+    return lines
+
+
 def overview(examples: Sequence[Example]) -> str:
     """Text of `selective-depth --help`: examples first, then the commands by group."""
     lines = ["Measure depth where it counts: selective acquisition for Kinect-class sensors."]
@@ -125,11 +144,9 @@ def overview(examples: Sequence[Example]) -> str:
     lines += [
         "",
         f"'{PROGRAM} COMMAND --help' tells all about a command. With any command:",
-        "  -v, --verbose        say more",
-        "  --debug              show the traceback of an error",
-        "  --settings FILE      take options from a TOML file; the command line wins",
-        "  --preset paper       take the options that the paper's section V was made with",
-        *_SOURCE_HELP,
+        *(f"  {'-v, ' * (name == 'verbose')}--{name}".ljust(23) + told for name, told in _SWITCHES.items()),
+        *(f"  --{name} {value}".ljust(23) + told for name, (value, told) in _OPTIONS.items()),
+        *_source_help(),
         "Alone:",
         "  --version            versions of this program and of the OpenNI2 runtime found",
         f"  --completion SHELL   print a completion script for {', '.join(SHELLS)}",
@@ -253,7 +270,7 @@ def _one_line(boxed: str, name: str) -> str:
 
 
 def completion(shell: str) -> str:
-    """Shell script that completes every command and option.
+    """Shell script that completes every command, every option and the names of files.
 
     Raises
     ------
@@ -261,15 +278,42 @@ def completion(shell: str) -> str:
         If the shell is not one of `SHELLS`.
     """
     if shell not in SHELLS:
-        raise UsageError(f"completion is there for {' and '.join(SHELLS)}, not for '{shell}'.")
+        known = f"{', '.join(SHELLS[:-1])} and {SHELLS[-1]}"
+        raise UsageError(f"completion is there for {known}, not for '{shell}'.")
     import tyro
 
     script = io.StringIO()
     with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
         tyro.extras.subcommand_cli_from_dict(
-            {each.name: each.run for each in COMMANDS.values()},
+            {each.name: _with_all_options(each) for each in COMMANDS.values()},
             prog=PROGRAM,
             args=["--tyro-print-completion", shell],
             config=(tyro.conf.FlagCreatePairsOff,),
         )
-    return script.getvalue()
+    # Fish takes each line of a description for a completion of its own.
+    completed = re.sub(
+        "^COMPLETION_SPEC = .*", lambda spec: re.sub(r"\\+n", " ", spec[0]), script.getvalue(), flags=re.M
+    )
+    return completed + FISH_FILES * (shell == "fish")
+
+
+def _with_all_options(chosen: Command) -> Run:
+    """A command's function that takes the options, too, which others take out of a command line before it is parsed."""
+    import tyro
+
+    def run(*args: Any, **kwargs: Any) -> None: ...
+
+    own = inspect.signature(chosen.run, eval_str=True)
+    valued = _OPTIONS | (SOURCE_OPTIONS if set(SOURCES) & set(own.parameters) else {})
+    fields: list[tuple[str, Any, Any]] = [
+        (name, Annotated[str, tyro.conf.arg(metavar=value, help=told)], "") for name, (value, told) in valued.items()
+    ]
+    fields += [(name, Annotated[bool, tyro.conf.arg(help=told)], False) for name, told in _SWITCHES.items()]
+    more = make_dataclass("More", fields)
+    taken = inspect.Parameter("more", inspect.Parameter.KEYWORD_ONLY, default=more(),
+                              annotation=Annotated[more, tyro.conf.arg(name="")])  # fmt: skip
+    parameters = [*own.parameters.values(), taken]
+    run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
+    run.__doc__ = chosen.run.__doc__
+    return run

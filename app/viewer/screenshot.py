@@ -48,7 +48,7 @@ def screenshot(
     time_s : float, optional
         Instead of a frame: seconds since the first one.
     view : str, optional
-        Title of the one view to show, or the beginning of it; by default all of them.
+        Title of the one view to show, or a part of it; by default all of them.
     size : tuple of int, default (1920, 1080)
         Width and height of the window; one view alone is a little smaller.
 
@@ -128,7 +128,7 @@ def _maximised(client: ViewerClient, title: str) -> str:
     """Let one view have the whole window; returns its id."""
     views = sorted(client.get_state().views, key=lambda each: each.name)
     views = [each for each in views if each.view_class != "2D" or not each.name.endswith(": lines")]
-    for like in (str.__eq__, str.startswith):
+    for like in (str.__eq__, str.__contains__):
         found = [each.view_id for each in views if like(each.name.lower(), title.lower())]
         if found:
             shown = client.get_blueprint("recording")

@@ -7,6 +7,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -127,8 +128,33 @@ def test_version_names_both(capsys: pytest.CaptureFixture[str]) -> None:
 def test_completion_knows_the_commands(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["--completion", shell]) == 0
     script = capsys.readouterr().out
-    assert "replay" in script
-    assert "--gas.nodes" in script
+    for word in ("replay", "--gas.nodes", "--scale", "--preset", "--debug"):
+        assert word in script
+
+
+def test_fish_completes_commands_options_choices_and_files(tmp_path: Path) -> None:
+    fish = shutil.which("fish")
+    if fish is None:
+        pytest.skip("no fish: apt-get install fish")
+    script = subprocess.run([sys.executable, "-m", "selective_depth.app", "--completion", "fish"],
+                            capture_output=True, text=True, check=True).stdout  # fmt: skip
+    (tmp_path / "selective-depth.fish").write_text(script)
+    (tmp_path / "walk.oni").touch()
+
+    def completed(line: str) -> set[str]:
+        source = f"source selective-depth.fish; complete --do-complete '{line}'"
+        done = subprocess.run([fish, "--no-config", "-c", source], cwd=tmp_path, capture_output=True, text=True)
+        assert done.stderr == ""
+        return {found.partition("\t")[0] for found in done.stdout.splitlines()}
+
+    assert completed("selective-depth rep") == {"replay"}
+    assert completed("selective-depth replay --layout ") == {"engineer", "visitor"}
+    assert completed("selective-depth replay --budg") == {"--budget"}
+    assert completed("selective-depth replay wal") == {"walk.oni"}
+    every = completed("selective-depth replay --")
+    assert {"--scale", "--settings", "--gas.nodes", "--near-mm"} <= every
+    assert all(found.startswith("-") for found in every), "a description's second line is no option"
+    assert "--scale" not in completed("selective-depth screenshot x.rrd --")
 
 
 # Wrong usage
@@ -145,7 +171,7 @@ def test_completion_knows_the_commands(shell: str, capsys: pytest.CaptureFixture
         (["bench", "--frames", "0"], "--frames is 0; it must be 1 or more"),
         (["model", "x", "out", "--frame", "-1"], "--frame is -1; it must be 0 or more"),
         (["snapshot", "x", "--dpi", "0"], "--dpi is 0; it must be from 10 to 2,400"),
-        (["--completion", "fish"], "bash and zsh, not for 'fish'"),
+        (["--completion", "tcsh"], "bash, zsh and fish, not for 'tcsh'"),
         (["replay", "x", "y"], "'replay' takes one source, and 'y' is another; 'batch' takes several. "),
         (["replay", "x", "--gas.nods", "3"], "--gas.nods, 3: did you mean --gas.nodes?"),
         (["replay", "x", "--gas.nodes", "many"], "--gas.nodes"),

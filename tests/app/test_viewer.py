@@ -360,7 +360,7 @@ def test_a_picture_shows_the_frame_that_was_asked_for(tmp_path: Path) -> None:
         blue, green, red = (int(DEPTH_COLOURS[level]) >> shift & 255 for shift in (8, 16, 24))
         like = np.abs(view - (blue, green, red)).max(axis=1) < 12
         assert like.mean() > 0.3, "the frame's depth is not what is seen of the sensor"
-    alone = picture_of(recording, time_s=0.02, view="1 sens", size=(400, 300))
+    alone = picture_of(recording, time_s=0.02, view="sens", size=(400, 300))
     assert alone.shape[0] < 300 and 380 < alone.shape[1] <= 400
     middle = alone[100:150, 150:250].reshape(-1, 3).astype(int)
     assert (np.abs(middle - palette.channels(DEPTH_COLOURS[0])[::-1]).max(axis=1) < 12).all()
