@@ -85,10 +85,12 @@ recordings: $(VENV)/.tests-installed ## Make the recordings in recordings/ again
 
 pictures: $(VENV)/.installed ## Make the pictures of the README and the documentation again
 	@.ci/system-packages libopenni2-0 $(WINDOW_PACKAGES)
-	@$(BIN)/selective-depth replay --headless --save out/viewer.rrd --budget 0.05 --rounds 4
+	@mkdir -p out
+	@$(BIN)/selective-depth replay --headless --save out/viewer.rrd --overwrite --budget 5% --rounds 4
 	@$(BIN)/selective-depth screenshot out/viewer.rrd app/docs/pictures/viewer.webp
 	@$(BIN)/selective-depth snapshot virtual:workstation virtual:ball virtual:firehose --frame 5 --budget 5% --rounds 8 --out app/docs/pictures/sheet.webp
 	@$(BIN)/selective-depth evaluate "virtual:workstation?seed=7" --frames 1 --budget 0.05 --picture app/docs/pictures/evaluation.webp
+	@$(BIN)/selective-depth evaluate "virtual:workstation?speed=0&frames=30" --over-time --budget 2% --picture app/docs/pictures/memory.webp
 	@$(BIN)/python tests/make_virtual_docs.py
 
 wheel: $(VENV)/.installed ## Build dist/*.whl
