@@ -115,7 +115,7 @@ class Shown:
             for key, (title, meaning) in self.titles.items()
             if not self.visitor or key in ("gas", "score")
         ]
-        return "\n".join(["From left to right: measured → wanted → known.\n"] * (not self.visitor) + lines)
+        return "\n".join(["Measured → wanted → known.\n"] * (not self.visitor) + lines)
 
     def legend(self, limits_mm: tuple[float, float]) -> legend.Image:
         """The colours of these pictures."""
