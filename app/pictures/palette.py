@@ -231,11 +231,13 @@ def picture(scales: Sequence[Scale], swatches: Sequence[Swatch], columns: int = 
     return image
 
 
-def key(lines: Sequence[Swatch]) -> Image:
-    """Draw what the lines of a plot are, to stand beside it, where it covers none of them."""
-    width = max(cv2.getTextSize((0, 0), text, (0, 0), _FACE, 24, 400)[2] for text, _ in lines) + 40
-    image = np.full((34 * len(lines), width, 3), BACKGROUND, np.uint8)
-    for row, (text, colour) in enumerate(lines):
+def key(unit: str, lines: Sequence[Swatch]) -> Image:
+    """Draw the unit of a plot and what its lines are, to stand beside it, where that covers none of them."""
+    texts = [unit, *(text for text, _ in lines)]
+    width = max(180, *(cv2.getTextSize((0, 0), text, (0, 0), _FACE, 24, 400)[2] for text in texts)) + 40
+    image = np.full((34 * len(texts), width, 3), BACKGROUND, np.uint8)
+    _write(image, unit, 0, 25, 24)
+    for row, (text, colour) in enumerate(lines, 1):
         image[34 * row + 14 : 34 * row + 20, :24] = channels(colour)
         _write(image, text, 32, 34 * row + 25, 24)
     return image

@@ -17,6 +17,9 @@ TITLES = {
     "seeds": ("2 Seeds", "the lattice that is measured first: all that the selectors know"),
     "gas": ("3a Neural gas", "nodes settle on surfaces; triangles whose edges are short are the regions it selects"),
     "score": ("3b Improvement", "where one more measurement would help"),
+    "long": ("3a Edges", "the triangles that are left out: steps between surfaces"),
+    "estimate": ("3b Estimate", "kriged depth between the seeds"),
+    "deviation": ("3b Deviation", "how far that is expected to be off"),
     "samples": ("4 By {by}", "what was measured besides, where this selector wanted it, round by round"),
     "known": ("4 Known, by age", "all that is known, bright where just measured; red where forgotten"),
     "even": ("5 Even lattice", "the model of as many measurements, spread evenly"),
@@ -84,20 +87,23 @@ class Shown:
             "whole": self.by and not self.truth,
             "truth": self.by and self.truth,
         } | dict.fromkeys(("samples", "even", "model", "even_error", "error"), self.by)
+        there |= dict.fromkeys(("long", "estimate", "deviation"), self.detail and not self.visitor)
         there["score"] = there["seeds"] = there["gas"]
         titles = {key: words for key, words in TITLES.items() if there.get(key, True)}
         return {key: (self._title(title), meaning) for key, (title, meaning) in titles.items()}
 
     @property
-    def plots(self) -> dict[str, tuple[str, list[str]]]:
-        """Plots of running figures by their key: title, and names out of `palette.FIGURES`."""
+    def plots(self) -> dict[str, tuple[str, str, list[str]]]:
+        """Plots of running figures by their key: title, unit, and names out of `palette.FIGURES`."""
         errors = ["quantisation_error_mm", *["rmse_mm", "even_rmse_mm"] * bool(self.by)]
         errors += ["truth_rmse_mm", "sensor_rmse_mm"] * bool(self.by and self.truth)
-        plots = {"fps": ("Frames/s", ["fps"])}
-        plots["dropped"] = ("Dropped", ["dropped_sensor"] * self.live + ["dropped_viewer"])
-        plots["errors"] = ("Errors, mm", errors)
+        plots = {
+            "fps": ("Frames/s", "", ["fps"]),
+            "dropped": ("Dropped", "frames", ["dropped_sensor"] * self.live + ["dropped_viewer"]),
+            "errors": ("Errors", "mm", errors),
+        }
         if self.memory:
-            plots["pixels"] = ("Pixels, %", ["measured_percent", "known_percent"])
+            plots["pixels"] = ("Pixels", "%", ["measured_percent", "known_percent"])
         return plots
 
     def _title(self, title: str) -> str:
@@ -148,7 +154,9 @@ def blueprint(shown: Shown, look_at_m: float = 2.0, limits_mm: tuple[float, floa
         parts += [_pictures_for_visitors(shown, views), rrb.Horizontal(*_colours(titlebar=False))]
         shares += [1.0, 0.12]
     else:
-        parts.append(rrb.Horizontal(_pictures(shown, views), _figures(shown), column_shares=[4, 1.08]))
+        parts.append(
+            rrb.Horizontal(_pictures(shown, views), _figures(shown), column_shares=[4.3 if shown.detail else 3.7, 1])
+        )
         shares.append(1.0)
     return rrb.Blueprint(
         rrb.Vertical(*parts, row_shares=shares),
@@ -162,12 +170,15 @@ def blueprint(shown: Shown, look_at_m: float = 2.0, limits_mm: tuple[float, floa
 def _views(shown: Shown, look_at_m: float, limits_mm: tuple[float, float]) -> dict[str, Part]:
     """A view of each picture that there is, by its key in `TITLES`."""
     grey = _grey(limits_mm)
-    over = {"gas": grey}
+    over = {"gas": grey, "long": grey}
     contents = {
         "sensor": ("depth", "holes"),
         "seeds": ("seeds",),
         "gas": ("gas/mask", *(f"gas/{layer}" for layer in ("triangles", "nodes") if layer not in shown.hide)),
         "score": ("improvement/score",),
+        "long": ("gas/complement",),
+        "estimate": ("improvement/estimate", "improvement/unknown"),
+        "deviation": ("errors/expected",),
         "samples": ("samples", "holes"),
         "known": ("memory/age", "memory/changed"),
         "even": ("even",),
@@ -183,10 +194,6 @@ def _views(shown: Shown, look_at_m: float, limits_mm: tuple[float, float]) -> di
     }
     if "scene" in titles:
         views["scene"] = rrb.Spatial2DView(origin="/colour", name=titles["scene"], background=legend.BACKGROUND)
-    if shown.detail and "gas" in titles:
-        views["gas"] = rrb.Tabs(views["gas"], _image("Long edges", "gas/complement", over=grey))
-        estimate = _image("Estimate", "improvement/estimate", "improvement/unknown")
-        views["score"] = rrb.Tabs(views["score"], estimate, _image("Deviation", "errors/expected"))
     away_m = look_at_m * (0.4 if shown.by else 0.5)  # without a budget the view is taller than wide
     eye = rrb.EyeControls3D(
         position=(-away_m, -0.9 * away_m, look_at_m - 3 * away_m), look_target=(0, 0, look_at_m), eye_up=(0, -1, 0)
@@ -220,9 +227,10 @@ def _columns(views: dict[str, Part], *columns: tuple[str, ...]) -> list[rrb.Vert
 
 def _pictures(shown: Shown, views: dict[str, Part]) -> rrb.Horizontal:
     """All of them: what is measured, then wanted; with a budget, what both models are like below."""
+    inner = [("long", "estimate", "deviation")] * shown.detail
     if not shown.by:
-        columns = _columns(views, ("scene", "sensor", "seeds"), ("gas", "score"), ("space",))
-        return rrb.Horizontal(*columns, column_shares=[0.9, 1, 1.7])
+        columns = _columns(views, ("scene", "sensor", "seeds"), *inner, ("gas", "score"), ("space",))
+        return rrb.Horizontal(*columns, column_shares=[0.9, *[0.9] * len(inner), 1, 1.7])
     if "known" in views:
         views["samples"] = rrb.Tabs(views["known"], views["samples"])
     views["colours"] = rrb.Tabs(*_colours())
@@ -230,11 +238,12 @@ def _pictures(shown: Shown, views: dict[str, Part]) -> rrb.Horizontal:
     columns = _columns(
         views,
         ("scene", "sensor", "seeds", "samples"),
+        *inner,
         ("gas", "even", "even_error"),
         ("score", "model", "error"),
         ("space", last, "colours"),
     )
-    return rrb.Horizontal(*columns, column_shares=[0.9, 1, 1, 1])
+    return rrb.Horizontal(*columns, column_shares=[0.9, *[0.9] * len(inner), 1, 1, 1])
 
 
 def _pictures_for_visitors(shown: Shown, views: dict[str, Part]) -> rrb.Horizontal:
@@ -281,7 +290,7 @@ def _grey(limits_mm: tuple[float, float]) -> rr.DepthImage:
 def _figures(shown: Shown) -> rrb.Vertical:
     """How the run fares: plots, each with its key beside it, and the sensor's state."""
 
-    def plot(key: str, title: str, names: list[str]) -> Part:
+    def plot(key: str, title: str, unit: str, names: list[str]) -> Part:
         view = rrb.TimeSeriesView(
             origin="/figures",
             contents=[f"/figures/{name}" for name in names],
@@ -290,9 +299,9 @@ def _figures(shown: Shown) -> rrb.Vertical:
         )
         beside = rrb.Spatial2DView(origin=f"/keys/{key}", titlebar=False, name=f"{title}: lines",
                                    background=legend.BACKGROUND)  # fmt: skip
-        return view if len(names) == 1 and key != "stages" else rrb.Horizontal(view, beside, column_shares=[2.6, 1])
+        return rrb.Horizontal(view, beside, column_shares=[2.6, 1]) if unit else view
 
-    plots = [plot("stages", "Stages, ms", ["stages"])]
+    plots = [plot("stages", "Stages", "ms", ["stages"])]
     plots += [plot(key, *of) for key, of in shown.plots.items()]
     states = [rrb.StateTimelineView(origin="/sensor/state", name="Sensor")] * shown.live
     first = [] if shown.by else [rrb.Tabs(*_colours())]

@@ -123,7 +123,7 @@ class StepLogger:
         log("figures/stages", rr.SeriesLines(names=names, colors=list(legend.STAGE_COLOURS)), static=True)
         for name, (label, colour) in legend.FIGURES.items():
             log(f"figures/{name}", rr.SeriesLines(names=label, colors=colour), static=True)
-        log("keys/stages", _png(legend.key(list(zip(names, legend.STAGE_COLOURS, strict=True)))), static=True)
+        log("keys/stages", _png(legend.key("ms", list(zip(names, legend.STAGE_COLOURS, strict=True)))), static=True)
 
     def _shown_of(self, step: FrameResult) -> Shown:
         """What there is to see in a step; what was there once stays."""
@@ -149,8 +149,9 @@ class StepLogger:
         if step.frame.colour_camera is not None:
             self._log_camera(step.frame.colour_camera, "colour")
         self._stream.log("legend", _png(shown.legend(self._limits_mm)), static=True)
-        for plot, (_, names) in shown.plots.items():
-            self._stream.log(f"keys/{plot}", _png(legend.key([legend.FIGURES[name] for name in names])), static=True)
+        for plot, (_, unit, names) in shown.plots.items():
+            lines = [legend.FIGURES[name] for name in names]
+            self._stream.log(f"keys/{plot}", _png(legend.key(unit, lines)), static=True)
         self._stream.log("guide", rr.TextDocument(shown.guide, media_type="text/markdown"), static=True)
 
     def _log_camera(self, camera: Camera, entity: str = "camera") -> None:

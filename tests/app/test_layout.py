@@ -83,6 +83,15 @@ def test_the_panel_of_what_was_acquired_names_its_selector(by: str) -> None:
     assert f"**4 By {plain}**" in Shown(by=by).guide
 
 
+def test_inner_read_outs_have_views_and_titles_of_their_own() -> None:
+    inner = {"3a Edges", "3b Estimate", "3b Deviation"}
+    for by in ("", "step score"):
+        shown = Shown(by=by, detail=True)
+        assert inner <= set(titles_of(shown)) and all(title in shown.guide for title in inner)
+        assert not inner & set(titles_of(dataclasses.replace(shown, detail=False)))
+        assert len(titles_of(dataclasses.replace(shown, visitor=True))) == len(titles_of(Shown(by=by, visitor=True)))
+
+
 def test_visitors_see_no_figures_and_no_numbers() -> None:
     for by in ("", "step score"):
         views = views_of(blueprint(Shown(by=by, visitor=True, memory=bool(by), live=True)))
@@ -119,7 +128,7 @@ def test_a_layer_that_is_hidden_is_in_no_view(layer: str) -> None:
 def test_rates_and_counts_have_plots_of_their_own_and_no_legend_covers_a_curve() -> None:
     shown = Shown(by="step score", memory=True, truth=True, live=True)
     plots = [view for view in views_of(blueprint(shown)) if isinstance(view, rrb.TimeSeriesView)]
-    assert [plot.name for plot in plots] == ["Stages, ms", "Frames/s", "Dropped", "Errors, mm", "Pixels, %"]
+    assert [plot.name for plot in plots] == ["Stages", "Frames/s", "Dropped", "Errors", "Pixels"]
     for plot in plots:
         assert plot.properties["PlotLegend"].visible.as_arrow_array().to_pylist() == [False]
 

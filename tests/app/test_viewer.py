@@ -378,7 +378,7 @@ def test_a_picture_of_what_is_not_there_is_refused(
     asked: dict[str, Any], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spans = [SimpleNamespace(name="frame", start=0, end=2), SimpleNamespace(name="time", start=0, end=500_000_000)]
-    views = [SimpleNamespace(name=name, view_class="2D") for name in ("In space", "1 Sensor", "Stages, ms: lines")]
+    views = [SimpleNamespace(name=name, view_class="2D") for name in ("In space", "1 Sensor", "Stages: lines")]
     shown = SimpleNamespace(store_id="it", timelines=spans)
     state = SimpleNamespace(recordings=[shown], active_recording="it", loading=[], views=views)
     client = SimpleNamespace(open=lambda path: None, get_state=lambda: state)
