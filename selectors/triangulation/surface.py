@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
-from selective_depth.selectors.arrays import Bools, Floats, Ints
+from selective_depth.selectors.arrays import Bools, Bytes, Floats, Ints
 from selective_depth.selectors.parallel import in_bands
-from selective_depth.selectors.triangulation.delaunay import GHOST, Mesh
+from selective_depth.selectors.triangulation.delaunay import Mesh
+from selective_depth.selectors.triangulation.flips import GHOST, NEXT
 from selective_depth.selectors.triangulation.nearest import FAR_SQ, nearest_sample
 
 STEP_MM = 50.0
@@ -30,6 +31,11 @@ MANY_TRIANGLES = 20_000
 
 TILE_PX = 16
 """Side of the square tiles in which changes are booked."""
+
+_PLAIN, _BRIDGE, _OUTSIDE = 0, 1, 2
+"""Kinds of triangles: linear, spanning a hole or a step, outside of the hull."""
+
+_SURE = 1e-6
 
 Whole = int | np.int32 | np.int64
 
@@ -65,6 +71,13 @@ class Layers(NamedTuple):
     plain: Bools
     spread_mm2: Floats
     touched: Bools
+
+
+class Points(NamedTuple):
+    """The samples as the triangulation has them: pixels (n, 2), column first, and depths (n,) in mm."""
+
+    uv: Ints
+    z_mm: Floats
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -119,9 +132,8 @@ def _claim(layers: Layers, uv: Ints) -> None:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _bridges(uv: Ints, z_mm: Floats, corners: Ints) -> bool:
+def _bridges(uv: Ints, z_mm: Floats, a: int, b: int, c: int) -> bool:
     """Whether a triangle of three points spans a hole or a depth step."""
-    a, b, c = corners[0], corners[1], corners[2]
     if max(z_mm[a], z_mm[b], z_mm[c]) - min(z_mm[a], z_mm[b], z_mm[c]) <= STEP_MM:
         return False
     longest = max(
@@ -132,91 +144,131 @@ def _bridges(uv: Ints, z_mm: Floats, corners: Ints) -> bool:
     return bool(longest > BRIDGE_PX * BRIDGE_PX)
 
 
-@njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def _along_edge(uv: Ints, z_mm: Floats, corners: Ints, across: int, u: int, v: int) -> np.float32:
-    """Depth at a pixel of the edge across from a corner: to the last bit, either triangle's."""
-    a, b = corners[(across + 1) % 3], corners[(across + 2) % 3]
-    if a > b:
-        a, b = b, a
-    du, dv = uv[b, 0] - uv[a, 0], uv[b, 1] - uv[a, 1]
-    step, whole = (u - uv[a, 0], du) if abs(du) >= abs(dv) else (v - uv[a, 1], dv)
-    return np.float32(z_mm[a] + (z_mm[b] - z_mm[a]) * np.float64(step) / np.float64(whole))
+@njit(cache=True, nogil=True)
+def _sort_out(changed: Bools, uv: Ints, z_mm: Floats, tri: Ints, kind: Bytes, drawn: Ints) -> int:
+    """Say of what kind each changed triangle is, and list those to be drawn; their number is returned."""
+    count = 0
+    for t in range(len(changed)):
+        if not changed[t]:
+            continue
+        changed[t] = False
+        a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
+        if a == GHOST or b == GHOST or c == GHOST:
+            kind[t] = _OUTSIDE
+            continue
+        kind[t] = _BRIDGE if _bridges(uv, z_mm, a, b, c) else _PLAIN
+        drawn[count] = t
+        count += 1
+    return count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(first: int, end: int, changed: Ints, layers: Layers, uv: Ints, z_mm: Floats, tri: Ints, adj: Ints) -> None:
+def _draw_edge(layers: Layers, points: Points, a: int, b: int, plainly: bool, spread: np.float32) -> None:
+    """Draw the pixels between two points: to the last bit the same from either side.
+
+    `spread` is theirs too if it is not negative.
+    """
+    if a > b:
+        a, b = b, a
+    u, v = points.uv[a, 0], points.uv[a, 1]
+    du, dv = points.uv[b, 0] - u, points.uv[b, 1] - v
+    steps, rest = abs(du), abs(dv)
+    while rest:
+        steps, rest = rest, steps % rest
+    width = layers.depth_mm.shape[1]
+    z, rise = points.z_mm[a], points.z_mm[b] - points.z_mm[a]
+    for step in range(1, steps):
+        x, y = u + du // steps * step, v + dv // steps * step
+        near = layers.nearest[y, x]
+        layers.plain[y, x] = plainly
+        layers.depth_mm[y, x] = (
+            z + rise * np.float64(step) / np.float64(steps) if plainly else layers.samples_mm[near // width, near % width]
+        )
+        if spread >= 0:
+            layers.spread_mm2[y, x] = spread
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill(layers: Layers, points: Points, a: int, b: int, c: int, bridge: bool, spread: np.float32) -> None:
+    """Draw a triangle's inside, its right edges, and its upper one if that is level.
+
+    So each pixel of an edge is drawn by one of its two triangles.
+    """
+    uv, z_mm = points.uv, points.z_mm
+    if uv[b, 1] < uv[a, 1]:
+        a, b = b, a
+    if uv[c, 1] < uv[b, 1]:
+        b, c = c, b
+        if uv[b, 1] < uv[a, 1]:
+            a, b = b, a
+    # Now from top to bottom: a row crosses the edge ac and one of the others.
+    u0, v0, u1, v1 = np.int64(uv[a, 0]), np.int64(uv[a, 1]), np.int64(uv[b, 0]), np.int64(uv[b, 1])
+    u2, v2 = np.int64(uv[c, 0]), np.int64(uv[c, 1])
+    area = np.float64((u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0))
+    z0, z01, z02 = np.float64(z_mm[a]), np.float64(z_mm[b] - z_mm[a]), np.float64(z_mm[c] - z_mm[a])
+    along, down = (z01 * (v2 - v0) - z02 * (v1 - v0)) / area, (z02 * (u1 - u0) - z01 * (u2 - u0)) / area
+    # Crossings are whole or at least 1 / height from it: a little more, and none is cut off.
+    ac, ab, bc = (u2 - u0) / (v2 - v0), (u1 - u0) / max(v1 - v0, 1), (u2 - u1) / max(v2 - v1, 1)
+    width = layers.depth_mm.shape[1]
+    for v in range(v0, v2):
+        long = int(u0 + (v - v0) * ac + _SURE)
+        short = int(u0 + (v - v0) * ab + _SURE) if v < v1 else int(u1 + (v - v1) * bc + _SURE)
+        first, end = (short, long) if area < 0 else (long, short)
+        z = z0 + (v - v0) * down
+        depth, plain, spreads = layers.depth_mm[v], layers.plain[v], layers.spread_mm2[v]
+        for u in range(first + 1, end + 1):
+            spreads[u] = spread
+            plain[u] = not bridge
+            if bridge:
+                near = layers.nearest[v, u]
+                depth[u] = layers.samples_mm[near // width, near % width]
+            else:
+                depth[u] = z + (u - u0) * along
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw(first: int, end: int, drawn: Ints, layers: Layers, points: Points, tri: Ints, adj: Ints, kind: Bytes) -> None:
     """Draw triangles into the model: those that bridge nothing linearly, the others not at all.
 
     Pixels on the edge that a bridge shares with a plain triangle are the plain one's, and a sample
     counts as plain. So whichever triangle is drawn last, the model is the same.
     """
-    width = layers.depth_mm.shape[1]
-    plain, owned = np.empty(3, np.bool_), np.empty(3, np.bool_)
-    for t in changed[first:end]:
+    uv, z_mm = points.uv, points.z_mm
+    for t in drawn[first:end]:
         a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
-        u0, v0 = np.int64(uv[a, 0]), np.int64(uv[a, 1])
-        u1, v1 = np.int64(uv[b, 0]), np.int64(uv[b, 1])
-        u2, v2 = np.int64(uv[c, 0]), np.int64(uv[c, 1])
         z0, z1, z2 = z_mm[a], z_mm[b], z_mm[c]
         mean = (z0 + z1 + z2) / np.float32(3)
         spread = ((z0 - mean) ** 2 + (z1 - mean) ** 2 + (z2 - mean) ** 2) / np.float32(3)
-        bridge = _bridges(uv, z_mm, tri[t])
+        bridge = kind[t] == _BRIDGE
+        _touch(
+            layers.touched, min(uv[a, 1], uv[b, 1], uv[c, 1]), min(uv[a, 0], uv[b, 0], uv[c, 0]),
+            max(uv[a, 1], uv[b, 1], uv[c, 1]), max(uv[a, 0], uv[b, 0], uv[c, 0]),
+        )  # fmt: skip
+        _fill(layers, points, a, b, c, bridge, spread)
         for k in range(3):
-            o = tri[adj[t, k]]
-            hull = o[0] == GHOST or o[1] == GHOST or o[2] == GHOST
-            plain[k] = bridge and not hull and not _bridges(uv, z_mm, o)
-            # Of two triangles, the edge's pixels are that one's which it bounds from above.
-            begin, end = tri[t, (k + 1) % 3], tri[t, (k + 2) % 3]
-            du, dv = uv[end, 0] - uv[begin, 0], uv[end, 1] - uv[begin, 1]
-            owned[k] = hull or dv > 0 or (dv == 0 and du > 0)
-        area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)  # positive: they run anticlockwise
-        inverse = 1 / area
-        left, right, top, bottom = (min(u0, u1, u2), max(u0, u1, u2), min(v0, v1, v2), max(v0, v1, v2))
-        _touch(layers.touched, top, left, bottom, right)
-        for v in range(top, bottom + 1):
-            # The three weights are linear along a row: one more pixel is one addition each.
-            w1 = (left - u0) * (v2 - v0) - (u2 - u0) * (v - v0)
-            w2 = (u1 - u0) * (v - v0) - (left - u0) * (v1 - v0)
-            entered = False
-            for u in range(left, right + 1):
-                w0 = area - w1 - w2
-                at1, at2 = w1, w2
-                w1, w2 = w1 + (v2 - v0), w2 - (v1 - v0)
-                if w0 < 0 or at1 < 0 or at2 < 0:
-                    if entered:
-                        break  # what is inside of a row is one run
-                    continue
-                entered = True
-                sample_mm = layers.samples_mm[v, u]
-                if sample_mm > 0:
-                    layers.plain[v, u] = True
-                    layers.depth_mm[v, u] = sample_mm
-                    layers.spread_mm2[v, u] = 0
-                    continue
-                if (w0 > 0 or owned[0]) and (at1 > 0 or owned[1]) and (at2 > 0 or owned[2]):
-                    layers.spread_mm2[v, u] = spread
-                edge = 0 if w0 == 0 else (1 if at1 == 0 else (2 if at2 == 0 else -1))
-                plainly = not bridge or (edge >= 0 and plain[edge])
-                layers.plain[v, u] = plainly
-                if not plainly:
-                    near = layers.nearest[v, u]
-                    layers.depth_mm[v, u] = layers.samples_mm[near // width, near % width]
-                elif edge >= 0:
-                    layers.depth_mm[v, u] = _along_edge(uv, z_mm, tri[t], edge, u, v)
-                else:
-                    layers.depth_mm[v, u] = (w0 * z0 + at1 * z1 + at2 * z2) * inverse
+            other = kind[adj[t, k]]
+            if other == _PLAIN and not bridge:
+                continue
+            begin, stop = tri[t, NEXT[k]], tri[t, NEXT[k + 1]]
+            du, dv = uv[stop, 0] - uv[begin, 0], uv[stop, 1] - uv[begin, 1]
+            filled = dv > 0 or (dv == 0 and du > 0)
+            if other == _OUTSIDE and not filled:
+                _draw_edge(layers, points, begin, stop, not bridge, spread)
+            elif (other == _PLAIN and filled) or (other == _BRIDGE and not filled):
+                _draw_edge(layers, points, begin, stop, not bridge or other == _PLAIN, np.float32(-1))
+        for p in (a, b, c):
+            u, v = uv[p, 0], uv[p, 1]
+            layers.plain[v, u] = True
+            layers.depth_mm[v, u] = z_mm[p]
+            layers.spread_mm2[v, u] = 0
 
 
 @njit(cache=True, nogil=True)
-def _mark_stars(tri: Ints, adj: Ints, other: Bools, changed: Bools) -> None:
-    """Mark the triangles of points whose depth is another now, and those that share an edge."""
+def _mark_stars(tri: Ints, other: Bools, changed: Bools) -> None:
+    """Mark the triangles of points whose depth is another now."""
     for t in range(len(tri)):
         for k in range(3):
-            if tri[t, k] != GHOST and other[tri[t, k]]:
-                changed[t] = True
-                for side in range(3):  # whether it bridges is seen along its edges
-                    changed[adj[t, side]] = True
-                break
+            changed[t] |= tri[t, k] != GHOST and other[tri[t, k]]
 
 
 @njit(cache=True, nogil=True)
@@ -265,6 +317,7 @@ class Surface:
         self._depth_mm = np.empty(0, np.float32)
         self._point = np.full(shape, -1, np.int32)
         self._mesh: Mesh | None = None
+        self._kind = np.empty(0, np.uint8)  # of every triangle
 
     @property
     def points(self) -> int:
@@ -291,7 +344,7 @@ class Surface:
                 other = np.zeros(len(self._uv), np.bool_)
                 other[point[again][differ]] = True
                 end = self._mesh.triangles
-                _mark_stars(self._mesh.tri[:end], self._mesh.adj[:end], other, self._mesh.changed[:end])
+                _mark_stars(self._mesh.tri[:end], other, self._mesh.changed[:end])
         self._insert(uv[point < 0], depth_mm[point < 0])
         self._draw_changed()
         if differ.any():
@@ -325,9 +378,10 @@ class Surface:
         mesh, layers = self._mesh, self.layers
         if mesh is None:  # nothing, or all on one line
             return
-        changed = np.flatnonzero(mesh.changed[: mesh.triangles])
-        inside = (mesh.tri[changed] != GHOST).all(axis=1)
-        mesh.changed[: mesh.triangles] = False
-        drawn = changed[inside].astype(np.int32)
-        threads = self._threads if len(drawn) > MANY_TRIANGLES else 1  # to begin some would take longer
-        in_bands(_draw, len(drawn), threads, drawn, layers, mesh.uv, self._depth_mm, mesh.tri, mesh.adj)
+        if len(self._kind) < len(mesh.tri):  # it has grown
+            self._kind = np.pad(self._kind, (0, len(mesh.tri) - len(self._kind)))
+        drawn = np.empty(mesh.triangles, np.int32)
+        points = Points(mesh.uv, self._depth_mm)
+        count = _sort_out(mesh.changed[: mesh.triangles], *points, mesh.tri, self._kind, drawn)
+        threads = self._threads if count > MANY_TRIANGLES else 1  # to begin some would take longer
+        in_bands(_draw, count, threads, drawn, layers, points, mesh.tri, mesh.adj, self._kind)

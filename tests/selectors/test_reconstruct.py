@@ -12,7 +12,8 @@ from scipy.spatial import ConvexHull
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.triangulation import BRIDGE_PX, STEP_MM, nearest_sample
-from selective_depth.selectors.triangulation.delaunay import GHOST, Mesh
+from selective_depth.selectors.triangulation.delaunay import Mesh
+from selective_depth.selectors.triangulation.flips import GHOST
 from selective_depth.selectors.triangulation.nearest import FAR_SQ
 
 Pixels = npt.NDArray[np.int32]

@@ -1,0 +1,157 @@
+"""The steps of a Delaunay triangulation of pixels: where a point lies, and turning an edge.
+
+Pixels have integer coordinates, so the two predicates (on which side of a line, inside which
+circle) are computed in 64-bit integers and are never wrong: no tolerance, no degenerate input.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from selective_depth.drivers.kernels import njit
+from selective_depth.selectors.arrays import Bools, Ints
+
+GHOST = -1
+"""The vertex at infinity."""
+
+NEXT = np.array([1, 2, 0, 1], np.int64)
+"""The corner after each, and after that."""
+
+
+@njit(cache=True, nogil=True, inline="always")
+def orient(uv: Ints, a: int, b: int, c: int) -> int:
+    """Twice the signed area of the triangle a, b, c: positive if c is on the left of ab."""
+    au, av = np.int64(uv[a, 0]), np.int64(uv[a, 1])
+    return int((uv[b, 0] - au) * (uv[c, 1] - av) - (uv[c, 0] - au) * (uv[b, 1] - av))
+
+
+@njit(cache=True, nogil=True)
+def in_disk(uv: Ints, a: int, b: int, c: int, p: int) -> bool:
+    """Is p strictly inside the circle through a, b, c (one of which may be the ghost)?"""
+    if a == GHOST or b == GHOST or c == GHOST:
+        if a == GHOST:
+            a, b = b, c
+        elif b == GHOST:
+            a, b = c, a
+        # The circle through infinity is the half-plane left of ab, and the open segment ab.
+        side = orient(uv, a, b, p)
+        if side != 0:
+            return side > 0
+        pu, pv = np.int64(uv[p, 0]), np.int64(uv[p, 1])
+        return bool((uv[a, 0] - pu) * (uv[b, 0] - pu) + (uv[a, 1] - pv) * (uv[b, 1] - pv) < 0)
+    pu, pv = np.int64(uv[p, 0]), np.int64(uv[p, 1])
+    au, av = uv[a, 0] - pu, uv[a, 1] - pv
+    bu, bv = uv[b, 0] - pu, uv[b, 1] - pv
+    cu, cv = uv[c, 0] - pu, uv[c, 1] - pv
+    return bool(
+        (au * au + av * av) * (bu * cv - cu * bv)
+        - (bu * bu + bv * bv) * (au * cv - cu * av)
+        + (cu * cu + cv * cv) * (au * bv - bu * av)
+        > 0
+    )
+
+
+@njit(cache=True, nogil=True)
+def locate(uv: Ints, tri: Ints, adj: Ints, p: int, t: int) -> int:
+    """Triangle that holds p, or a ghost triangle whose hull edge p sees, walking from t."""
+    came = -1
+    while True:
+        a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
+        if a != GHOST and b != GHOST and c != GHOST:
+            # The edge we came through need not be tried: p is on this side of it.
+            if adj[t, 0] != came and orient(uv, b, c, p) < 0:
+                came, t = t, adj[t, 0]
+            elif adj[t, 1] != came and orient(uv, c, a, p) < 0:
+                came, t = t, adj[t, 1]
+            elif adj[t, 2] != came and orient(uv, a, b, p) < 0:
+                came, t = t, adj[t, 2]
+            else:
+                return t
+        else:
+            k = 0 if a == GHOST else (1 if b == GHOST else 2)
+            if orient(uv, tri[t, NEXT[k]], tri[t, NEXT[k + 1]], p) > 0:
+                return t
+            came, t = t, adj[t, k]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _relink(adj: Ints, t: int, old: int, new: int) -> None:
+    """Tell triangle t that its neighbour `old` is now `new`."""
+    if adj[t, 0] == old:
+        adj[t, 0] = new
+    elif adj[t, 1] == old:
+        adj[t, 1] = new
+    else:
+        adj[t, 2] = new
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _flip(tri: Ints, adj: Ints, t: int, o: int) -> None:
+    """Turn the edge bc between t = (p, b, c) and o = (d, c, b) into pd; p is corner 0 of both."""
+    b, c = tri[t, 1], tri[t, 2]
+    j = 0
+    while tri[o, j] == b or tri[o, j] == c:
+        j += 1
+    d = tri[o, j]
+    n_bd, n_dc = adj[o, NEXT[j]], adj[o, NEXT[j + 1]]
+    n_cp = adj[t, 1]
+    tri[t, 2] = d
+    tri[o, 0], tri[o, 1], tri[o, 2] = tri[t, 0], d, c
+    adj[t, 0], adj[t, 1] = n_bd, o
+    adj[o, 0], adj[o, 1], adj[o, 2] = n_dc, n_cp, t
+    _relink(adj, n_bd, o, t)
+    _relink(adj, n_cp, t, o)
+
+
+@njit(cache=True, nogil=True)
+def insert(uv: Ints, tri: Ints, adj: Ints, count: int, p: int, t: int, stack: Ints, changed: Bools) -> None:
+    """Insert p into its triangle t; the two new triangles are `count` and `count + 1`."""
+    a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
+    na, nb, nc = adj[t, 0], adj[t, 1], adj[t, 2]
+    t1, t2 = count, count + 1
+    # Vertex 0 of every triangle of p's star is p; neighbour i lies across from vertex i.
+    tri[t, 0], tri[t, 1], tri[t, 2] = p, b, c
+    tri[t1, 0], tri[t1, 1], tri[t1, 2] = p, c, a
+    tri[t2, 0], tri[t2, 1], tri[t2, 2] = p, a, b
+    adj[t, 0], adj[t, 1], adj[t, 2] = na, t1, t2
+    adj[t1, 0], adj[t1, 1], adj[t1, 2] = nb, t2, t
+    adj[t2, 0], adj[t2, 1], adj[t2, 2] = nc, t, t1
+    _relink(adj, nb, t, t1)
+    _relink(adj, nc, t, t2)
+    stack[0], stack[1], stack[2] = t, t1, t2
+    changed[t] = changed[t1] = changed[t2] = True
+    top = 3
+    while top > 0:
+        top -= 1
+        t = stack[top]
+        o = adj[t, 0]
+        if in_disk(uv, tri[o, 0], tri[o, 1], tri[o, 2], p):
+            _flip(tri, adj, t, o)
+            changed[o] = True
+            stack[top], stack[top + 1] = t, o
+            top += 2
+
+
+@njit(cache=True, nogil=True)
+def settle(uv: Ints, tri: Ints, adj: Ints, count: int) -> None:
+    """Turn edges of a triangulation of any kind, with its ghosts, until every disk is empty."""
+    stack = np.empty(64, np.int32)
+    for newest in range(count):
+        stack[0] = newest
+        top = 1
+        while top > 0:
+            top -= 1
+            t = stack[top]
+            for k in range(3):
+                o, p = adj[t, k], tri[t, k]
+                # An edge is looked at when the later of its triangles comes. Hull edges stay.
+                if p == GHOST or max(o, t) > newest or not in_disk(uv, tri[o, 0], tri[o, 1], tri[o, 2], p):
+                    continue
+                for rows in (tri, adj):  # so that p is corner 0
+                    rows[t, 0], rows[t, 1], rows[t, 2] = rows[t, k], rows[t, NEXT[k]], rows[t, NEXT[k + 1]]
+                _flip(tri, adj, t, o)
+                if top + 2 > len(stack):
+                    stack = np.append(stack, stack)
+                stack[top], stack[top + 1] = t, o
+                top += 2
+                break
