@@ -54,28 +54,39 @@ def _score_tiles(
     `limits`: the squared reach of shots, pixels, and the variance where all agree, mm^2.
     """
     image_mm, miss_sq, score = images
-    reach_sq, noise_mm2 = limits
+    reach_sq, noise_mm2 = np.float32(limits[0]), np.float32(limits[1])
     height, width = score.shape
     columns = layers.touched.shape[1]
     depth = layers.depth_mm
-    for tile in tiles[first:end]:
+    here = np.empty(width + 2, np.float32)  # a run of a row and a pixel on either side
+    apart = np.full(width, 2, np.float32)  # between the columns that tell a slope
+    apart[0] = apart[-1] = 1
+    at = first
+    while at < end:
+        tile = tiles[at]
         top, left = tile // columns * TILE_PX, tile % columns * TILE_PX
+        at += 1
+        while at < end and tiles[at] == tiles[at - 1] + 1 and tiles[at] % columns:
+            at += 1  # neighbours in a row are one run
+        stop = min((tiles[at - 1] % columns + 1) * TILE_PX, width)
+        run, spans = stop - left, apart[left:stop]
         for v in range(top, min(top + TILE_PX, height)):
             above, below = max(v - 1, 0), min(v + 1, height - 1)
-            for u in range(left, min(left + TILE_PX, width)):
-                gap_sq = layers.gap_sq[v, u]
-                if image_mm[v, u] != 0 or gap_sq > reach_sq:
-                    score[v, u] = 0
-                    continue
-                before, after = max(u - 1, 0), min(u + 1, width - 1)
-                along = (depth[v, after] - depth[v, before]) / np.float32(max(after - before, 1))
-                down = (depth[below, u] - depth[above, u]) / np.float32(max(below - above, 1))
+            upper, lower = depth[above, left:stop], depth[below, left:stop]
+            rows_apart = np.float32(max(below - above, 1))
+            here[0], here[run + 1] = depth[v, max(left - 1, 0)], depth[v, min(stop, width - 1)]
+            here[1 : run + 1] = depth[v, left:stop]
+            known, near_sq, missed_sq = image_mm[v, left:stop], layers.gap_sq[v, left:stop], miss_sq[v, left:stop]
+            spread_mm2, scores = layers.spread_mm2[v, left:stop], score[v, left:stop]
+            for k in range(run):  # without a branch, it is computed for many pixels at once
+                along, down = (here[k + 2] - here[k]) / spans[k], (lower[k] - upper[k]) / rows_apart
                 slope = max(np.sqrt(along * along + down * down), _FLAT)
-                rise_mm = slope * np.sqrt(np.float32(gap_sq))
-                spread_mm = np.sqrt(layers.spread_mm2[v, u] + np.float32(noise_mm2))
-                nearness = np.float32(gap_sq) / np.float32(miss_sq[v, u])
-                returning = np.float32(1) / (np.float32(1) + nearness * nearness)
-                score[v, u] = rise_mm * np.sqrt(spread_mm) * returning
+                gap_sq = np.float32(near_sq[k])
+                rise_mm = slope * np.sqrt(gap_sq)
+                spread_mm = np.sqrt(spread_mm2[k] + noise_mm2)
+                nearness = gap_sq / np.float32(missed_sq[k])
+                worth = rise_mm * np.sqrt(spread_mm) / (np.float32(1) + nearness * nearness)
+                scores[k] = worth if known[k] == 0 and gap_sq <= reach_sq else np.float32(0)
 
 
 @dataclass(frozen=True)
