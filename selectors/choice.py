@@ -18,6 +18,7 @@ CROWDED = 0.3
 With 1 shots clump; with 0 (3x3 maxima first, whatever they are worth) they are wasted on maxima
 of nothing as soon as the good ones are gone. Between .2 and .7 it hardly matters."""
 
+_BLOCK = 32  # pixels of a row that are passed over together if none of them is worth enough
 _SAMPLED = 31  # shares no factor with the usual widths of images
 
 
@@ -25,22 +26,30 @@ _SAMPLED = 31  # shares no factor with the usual widths of images
 def _gather(score: Floats, least: float, crowded: float, pixel: Longs, worth: Floats, first: int, end: int) -> int:
     """Pixels of the rows first..end worth at least `least`, written from first's place on."""
     height, width = score.shape
+    limit = np.float32(least)
     at = first * width
     for v in range(first, end):
-        for u in range(width):
-            s = score[v, u]
-            if s <= 0 or s < least:
+        for left in range(0, width, _BLOCK):
+            block = score[v, left : left + _BLOCK]
+            some = np.int32(0)
+            for k in range(len(block)):  # without a branch, it is asked of many pixels at once
+                some |= np.int32((block[k] >= limit) & (block[k] > 0))
+            if not some:
                 continue
-            better = False
-            for y in range(max(v - 1, 0), min(v + 2, height)):
-                for x in range(max(u - 1, 0), min(u + 2, width)):
-                    better |= score[y, x] > s
-            if better:
-                s *= np.float32(crowded)
-                if s < least:
+            for u in range(left, left + len(block)):
+                s = score[v, u]
+                if s <= 0 or s < limit:
                     continue
-            pixel[at], worth[at] = v * width + u, s
-            at += 1
+                better = False
+                for y in range(max(v - 1, 0), min(v + 2, height)):
+                    for x in range(max(u - 1, 0), min(u + 2, width)):
+                        better |= score[y, x] > s
+                if better:
+                    s *= np.float32(crowded)
+                    if s < limit:
+                        continue
+                pixel[at], worth[at] = v * width + u, s
+                at += 1
     count: int = at - first * width
     return count
 
@@ -105,7 +114,11 @@ def choose(score: npt.ArrayLike, shots: int, *, crowded: float = CROWDED, thread
         raise ValueError(f"score must have shape (height, width), got {np.shape(score)}")
     if shots < 0:
         raise ValueError(f"shots is {shots}; give 0 or more")
-    worth = checked_map(score, np.shape(score), "score")
+    return best_pixels(checked_map(score, np.shape(score), "score"), shots, crowded=crowded, threads=threads)
+
+
+def best_pixels(worth: Floats, shots: int, *, crowded: float = CROWDED, threads: int | None = None) -> Ints:
+    """As `choose`, of a map known to be float32, whole in memory and nowhere negative or NaN."""
     # Most pixels are out of the question: a sample of them says where to draw a safe line.
     some = worth.ravel()[::_SAMPLED]
     rank = 4 * shots // _SAMPLED

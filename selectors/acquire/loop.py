@@ -216,7 +216,9 @@ def _allowed(uv: npt.ArrayLike, samples: Samples, left: int) -> Ints:
             f"the selector's plan asks for {len(pixels)} pixels where {left} are left, or for some"
             " that are measured already"
         )
-    if len(np.unique(places)) < len(places):
+    asked = np.zeros(samples.image_mm.size, np.bool_)
+    asked[places] = True
+    if np.count_nonzero(asked) < len(places):
         raise ValueError("the selector's plan asks for a pixel twice in one round")
     return pixels
 

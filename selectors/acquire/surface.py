@@ -17,7 +17,7 @@ import numpy as np
 
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Bools, Floats, Ints, Longs
-from selective_depth.selectors.choice import choose
+from selective_depth.selectors.choice import best_pixels
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import Samples
 from selective_depth.selectors.seeds import SeedGrid
@@ -39,8 +39,10 @@ def _note_misses(uv: Ints, depth_mm: Floats, radius: int, miss_sq: Ints, touched
         top, bottom = max(v0 - radius, 0), min(v0 + radius, height - 1)
         left, right = max(u0 - radius, 0), min(u0 + radius, width - 1)
         for v in range(top, bottom + 1):
-            for u in range(left, right + 1):
-                miss_sq[v, u] = min(miss_sq[v, u], (u - u0) ** 2 + (v - v0) ** 2)
+            row, off_sq = miss_sq[v, left : right + 1], np.int32((v - v0) * (v - v0))
+            for k in range(len(row)):
+                du = np.int32(left + k - u0)
+                row[k] = min(row[k], np.int32(du * du + off_sq))
         touched[top // TILE_PX : bottom // TILE_PX + 1, left // TILE_PX : right // TILE_PX + 1] = True
 
 
@@ -157,7 +159,7 @@ class SurfacePlan:
     def best(self, shots: int) -> Ints:
         """The `shots` pixels that are worth most, from the samples as they are now."""
         self.look()
-        return choose(self.score, shots, threads=self._rule.threads)
+        return best_pixels(self.score, shots, threads=self._rule.threads)
 
     def model_mm(self) -> Floats:
         """Dense depth of the samples as they are now, float32 (height, width); a copy."""
