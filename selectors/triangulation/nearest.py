@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from selective_depth.drivers.kernels import njit
@@ -17,22 +19,23 @@ _FAR = 1 << 20  # farther than any row of any image, and its square fits in 64 b
 @njit(cache=True, nogil=True)
 def _nearest_row_in_column(first: int, end: int, valid: Bools, nearest_row: Ints) -> None:
     """Per pixel of the columns first..end, the nearest row of its column with a sample."""
-    height = valid.shape[0]
-    for u in range(first, end):
-        last = -_FAR
-        for v in range(height):
-            if valid[v, u]:
-                last = v
-            nearest_row[v, u] = last
-        last = _FAR
-        for v in range(height - 1, -1, -1):
-            if valid[v, u]:
-                last = v
-            if last - v < v - nearest_row[v, u]:
-                nearest_row[v, u] = last
+    height = len(valid)
+    last = np.full(end - first, -_FAR, np.int32)
+    # Row by row, so that many columns are looked at together; down and up again.
+    for v in range(height):
+        row, nearest = valid[v, first:end], nearest_row[v, first:end]
+        for k in range(len(row)):
+            last[k] = np.int32(v) if row[k] else last[k]
+            nearest[k] = last[k]
+    last[:] = _FAR
+    for v in range(height - 1, -1, -1):
+        row, nearest = valid[v, first:end], nearest_row[v, first:end]
+        for k in range(len(row)):
+            last[k] = np.int32(v) if row[k] else last[k]
+            nearest[k] = last[k] if last[k] - v < v - nearest[k] else nearest[k]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _nearest_along_rows(first: int, end: int, nearest_row: Ints, nearest: Ints, gap_sq: Ints) -> None:
     """Lower envelope of the columns' parabolas, row by row: the exact nearest sample."""
     width = nearest_row.shape[1]
@@ -48,13 +51,13 @@ def _nearest_along_rows(first: int, end: int, nearest_row: Ints, nearest: Ints, 
             g = gap * gap
             begin = np.int64(0)
             while top >= 0:
-                # First integer pixel at which column u beats the envelope's last column.
+                # First integer pixel at which column u beats the envelope's last column. The
+                # quotient is whole or well off it, so that doubles floor it rightly.
                 p = column[top]
-                begin = (u * u - p * p + g - height_sq[top]) // (2 * (u - p)) + 1
-                if begin <= start[top]:
-                    top -= 1
-                else:
+                begin = np.int64(math.floor((u * u - p * p + g - height_sq[top]) / (2.0 * (u - p)))) + 1
+                if begin > start[top]:
                     break
+                top -= 1
             if top < 0:
                 begin = np.int64(0)
             if begin < width:
@@ -62,15 +65,17 @@ def _nearest_along_rows(first: int, end: int, nearest_row: Ints, nearest: Ints, 
                 column[top] = u
                 height_sq[top] = g
                 start[top] = begin
-        for u in range(width - 1, -1, -1):
-            if top < 0:
-                nearest[v, u] = -1
-                gap_sq[v, u] = FAR_SQ
-                continue
-            while start[top] > u:
-                top -= 1
-            nearest[v, u] = nearest_row[v, column[top]] * width + column[top]
-            gap_sq[v, u] = height_sq[top] + (u - column[top]) ** 2
+        if top < 0:
+            nearest[v] = -1
+            gap_sq[v] = FAR_SQ
+        stop = width
+        while top >= 0:
+            for u in range(start[top], stop):
+                du = u - column[top]
+                nearest[v, u] = nearest_row[v, column[top]] * width + column[top]
+                gap_sq[v, u] = height_sq[top] + du * du
+            stop = start[top]
+            top -= 1
 
 
 def nearest_sample(valid: Bools, threads: int | None = None) -> tuple[Ints, Ints]:
