@@ -29,7 +29,8 @@ BRIDGE_PX = 10.0
 MANY_TRIANGLES = 20_000
 """From so many on, triangles are drawn by several threads."""
 
-TILE_PX = 16
+_SHIFT = 4
+TILE_PX = 1 << _SHIFT
 """Side of the square tiles in which changes are booked."""
 
 _PLAIN, _BRIDGE, _OUTSIDE = 0, 1, 2
@@ -84,10 +85,12 @@ class Points(NamedTuple):
 def _touch(touched: Bools, top: Whole, left: Whole, bottom: Whole, right: Whole) -> None:
     """Book a change of pixels in these rows and columns, which their neighbours may heed."""
     rows, columns = touched.shape
-    first_column, last_column = max(left - 1, 0) // TILE_PX, (right + 1) // TILE_PX
-    for row in range(max(top - 1, 0) // TILE_PX, min((bottom + 1) // TILE_PX, rows - 1) + 1):
-        for column in range(first_column, min(last_column, columns - 1) + 1):
-            touched[row, column] = True
+    first_row, last_row = max(top - 1, 0) >> _SHIFT, min((bottom + 1) >> _SHIFT, rows - 1)
+    first_column, last_column = max(left - 1, 0) >> _SHIFT, min((right + 1) >> _SHIFT, columns - 1)
+    touched[first_row, first_column] = touched[first_row, last_column] = True
+    touched[last_row, first_column] = touched[last_row, last_column] = True
+    if last_row - first_row > 1 or last_column - first_column > 1:
+        touched[first_row : last_row + 1, first_column : last_column + 1] = True
 
 
 @njit(cache=True, nogil=True)
@@ -188,7 +191,7 @@ def _draw_edge(layers: Layers, points: Points, a: int, b: int, plainly: bool, sp
             layers.spread_mm2[y, x] = spread
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _fill(layers: Layers, points: Points, a: int, b: int, c: int, bridge: bool, spread: np.float32) -> None:
     """Draw a triangle's inside, its right edges, and its upper one if that is level.
 
@@ -214,16 +217,17 @@ def _fill(layers: Layers, points: Points, a: int, b: int, c: int, bridge: bool, 
         long = int(u0 + (v - v0) * ac + _SURE)
         short = int(u0 + (v - v0) * ab + _SURE) if v < v1 else int(u1 + (v - v1) * bc + _SURE)
         first, end = (short, long) if area < 0 else (long, short)
-        z = z0 + (v - v0) * down
         depth, plain, spreads = layers.depth_mm[v], layers.plain[v], layers.spread_mm2[v]
-        for u in range(first + 1, end + 1):
+        z = z0 + (v - v0) * down + (first + 1 - u0) * along
+        for u in range(np.uint64(first + 1), np.uint64(end + 1)):  # unsigned: none is counted from the end
             spreads[u] = spread
             plain[u] = not bridge
-            if bridge:
+            depth[u] = z
+            z += along
+        if bridge:
+            for u in range(first + 1, end + 1):
                 near = layers.nearest[v, u]
                 depth[u] = layers.samples_mm[near // width, near % width]
-            else:
-                depth[u] = z + (u - u0) * along
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
