@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 
 
@@ -44,16 +44,22 @@ def in_bands(kernel: Callable[..., object], rows: int, threads: int | None, *arg
     *arguments
         What else the kernel takes.
     """
-    count = min(threads or default_threads(), rows)
-    if count <= 1:
-        kernel(0, rows, *arguments)
-        return
+    count = max(min(threads or default_threads(), rows), 1)
     edges = [rows * band // count for band in range(count + 1)]
+    at_once(*(partial(kernel, *band, *arguments) for band in pairwise(edges)), threads=count)
+
+
+def at_once(*calls: Callable[[], object], threads: int | None = None) -> None:
+    """Call functions in parallel, or one after the other if `threads` is 1; wait for all."""
+    if len(calls) == 1 or (threads or default_threads()) == 1:
+        for call in calls:
+            call()
+        return
     pool = _pool(os.getpid())
-    waiting = [pool.submit(kernel, *band, *arguments) for band in pairwise(edges[1:])]
+    waiting = [pool.submit(call) for call in calls[1:]]
     try:
-        kernel(edges[0], edges[1], *arguments)
+        calls[0]()
     finally:
-        # Even if this band fails, no other may still be writing when we return.
+        # Even if the first fails, no other may still be writing when we return.
         for future in waiting:
             future.result()

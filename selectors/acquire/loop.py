@@ -182,7 +182,7 @@ def acquire(
     plan = plan_of(chosen_by, samples, threads)
     lattice_mm = seeds.depth_mm.ravel()
     uv, depth = [seeds.lattice_uv.reshape(-1, 2)], [lattice_mm]
-    whole = _fits_16_bits(lattice_mm) and bool((lattice_mm % 1 == 0).all())
+    whole = _fits_16_bits(lattice_mm) and bool((lattice_mm == np.rint(lattice_mm)).all())
     made: list[Round] = []
     for due in _shares(total, rounds, len(even_uv)):
         left = due - sum(r.shots for r in made)
@@ -191,7 +191,7 @@ def acquire(
         answer, new_mm = answers(measure, new_uv)
         _refuse_metres(new_mm, samples)
         whole &= np.issubdtype(answer.dtype, np.integer) and _fits_16_bits(new_mm)
-        samples.add(new_uv, new_mm)
+        samples.book(new_uv, new_mm)
         uv.append(new_uv)
         depth.append(new_mm)
         made.append(Round(len(new_uv), int(np.count_nonzero(new_mm))))
@@ -210,16 +210,11 @@ def acquire(
 def _allowed(uv: npt.ArrayLike, samples: Samples, left: int) -> Ints:
     """What a plan asks for, if it may: pixels of the frame, each for the first time, no more."""
     pixels = pixels_in(uv, samples.frame_shape, "the plan's pixels")
-    places = pixels[:, 1].astype(np.int64) * samples.frame_shape[1] + pixels[:, 0]
-    if len(pixels) > left or samples.image_mm.ravel()[places].any():
+    if len(pixels) > left or not samples.all_new(pixels):
         raise ValueError(
-            f"the selector's plan asks for {len(pixels)} pixels where {left} are left, or for some"
+            f"the selector's plan asks for {len(pixels)} pixels where {left} are left, or for a pixel twice, or for some"
             " that are measured already"
         )
-    asked = np.zeros(samples.image_mm.size, np.bool_)
-    asked[places] = True
-    if np.count_nonzero(asked) < len(places):
-        raise ValueError("the selector's plan asks for a pixel twice in one round")
     return pixels
 
 

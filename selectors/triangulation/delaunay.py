@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Bools, Ints, Longs
-from selective_depth.selectors.triangulation.flips import GHOST, insert, locate, orient
+from selective_depth.selectors.triangulation.flips import GHOST, height, insert, locate, orient
 from selective_depth.selectors.triangulation.rows import row_starts, zip_rows
 
 _LEAST_SHIFT = 3  # the square bins that remember a triangle to start a search from are 8 pixels wide
@@ -73,9 +73,7 @@ def _brio_keys(uv: Ints, keys: Longs) -> None:
     """Sort keys of an order that inserts fast: rounds of doubling size, each in snake tiles."""
     for i in range(len(uv)):
         u, v = np.int64(uv[i, 0]), np.int64(uv[i, 1])
-        # A fixed hash: the same points give the same triangles.
-        h = (u * 0x9E3779B1 + v * 0x85EBCA77) & 0xFFFFFFFF
-        h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
+        h = height(v, u)
         level = 0
         while level < 12 and (h >> level) & 1:
             level += 1
@@ -83,7 +81,7 @@ def _brio_keys(uv: Ints, keys: Longs) -> None:
         row, column = v >> size, u >> size
         if row & 1:
             column = 4095 - column
-        keys[i] = ((12 - level) << 40) | (row << 28) | (column << 16) | (h >> 16)
+        keys[i] = ((12 - level) << 40) | (row << 28) | (column << 16) | h
 
 
 @dataclass(eq=False)

@@ -25,9 +25,21 @@ def orient(uv: Ints, a: int, b: int, c: int) -> int:
     return int((uv[b, 0] - au) * (uv[c, 1] - av) - (uv[c, 0] - au) * (uv[b, 1] - av))
 
 
+@njit(cache=True, nogil=True, inline="always")
+def height(u: int, v: int) -> int:
+    """A fixed hash of a pixel: the higher it is, the more it counts as outside of a circle it lies on."""
+    h = (u * 0x9E3779B1 + v * 0x85EBCA77) & 0xFFFFFFFF
+    h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
+    return h >> 16
+
+
 @njit(cache=True, nogil=True)
 def in_disk(uv: Ints, a: int, b: int, c: int, p: int) -> bool:
-    """Is p strictly inside the circle through a, b, c (one of which may be the ghost)?"""
+    """Is p inside the circle through a, b, c (one of which may be the ghost)?
+
+    Of four points on one circle, as the corners of every lattice cell, the `height` decides. So
+    there is one triangulation of any points, in whatever order they come.
+    """
     if a == GHOST or b == GHOST or c == GHOST:
         if a == GHOST:
             a, b = b, c
@@ -43,12 +55,17 @@ def in_disk(uv: Ints, a: int, b: int, c: int, p: int) -> bool:
     au, av = uv[a, 0] - pu, uv[a, 1] - pv
     bu, bv = uv[b, 0] - pu, uv[b, 1] - pv
     cu, cv = uv[c, 0] - pu, uv[c, 1] - pv
-    return bool(
-        (au * au + av * av) * (bu * cv - cu * bv)
-        - (bu * bu + bv * bv) * (au * cv - cu * av)
-        + (cu * cu + cv * cv) * (au * bv - bu * av)
-        > 0
-    )
+    bc, ac, ab = bu * cv - cu * bv, au * cv - cu * av, au * bv - bu * av
+    inside = (au * au + av * av) * bc - (bu * bu + bv * bv) * ac + (cu * cu + cv * cv) * ab
+    if inside == 0:
+        low = height(pu, pv)
+        a_above, b_above, c_above = (
+            height(au + pu, av + pv) - low,
+            height(bu + pu, bv + pv) - low,
+            height(cu + pu, cv + pv) - low,
+        )
+        inside = a_above * bc - b_above * ac + c_above * ab
+    return bool(inside > 0)
 
 
 @njit(cache=True, nogil=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Ints, Longs
-from selective_depth.selectors.triangulation.flips import GHOST, NEXT, settle
+from selective_depth.selectors.triangulation.flips import GHOST, NEXT, height, settle
 
 
 def row_starts(uv: Ints) -> Longs | None:
@@ -57,8 +57,10 @@ def zip_rows(uv: Ints, starts: Longs, tri: Ints, adj: Ints) -> int:
         while a < last_a or b < last_b:
             u_a = uv[a + 1, 0] if a < last_a else 1 << 30
             u_b = uv[b + 1, 0] if b < last_b else 1 << 30
-            # Diagonals of a lattice's cells alternate, that none of their two directions is favoured.
-            along_a = u_a < u_b or (u_a == u_b and (a - starts[strip] + strip) & 1 == 0)
+            along_a = u_a < u_b
+            if u_a == u_b:  # the corners of a cell: the diagonal that `in_disk` will keep
+                u, upper, lower = uv[b, 0], uv[a, 1], uv[b, 1]
+                along_a = height(u_a, upper) + height(u, lower) < height(u, upper) + height(u_b, lower)
             tri[t, 0], tri[t, 1], tri[t, 2] = a, (a if along_a else b) + 1, b
             if before < 0:
                 _haunt(tri, adj, t, 1, left + strips - 1 - strip)

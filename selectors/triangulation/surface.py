@@ -8,89 +8,21 @@ a new sample are told so. The result is that of `selectors.reconstruct`, whateve
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
-from selective_depth.selectors.arrays import Bools, Bytes, Floats, Ints
-from selective_depth.selectors.parallel import in_bands
+from selective_depth.selectors.arrays import Bools, Floats, Ints
+from selective_depth.selectors.parallel import at_once, in_bands
 from selective_depth.selectors.triangulation.delaunay import Mesh
-from selective_depth.selectors.triangulation.flips import GHOST, NEXT
+from selective_depth.selectors.triangulation.draw import TILE_PX, Layers, Points, draw, sort_out, touch
+from selective_depth.selectors.triangulation.flips import GHOST
 from selective_depth.selectors.triangulation.nearest import FAR_SQ, nearest_sample
 
-STEP_MM = 50.0
-"""Depth span of a triangle's vertices above which it may bridge a hole or a step, millimetres."""
-
-BRIDGE_PX = 10.0
-"""Edge length above which such a triangle does, pixels."""
-
-MANY_TRIANGLES = 20_000
-"""From so many on, triangles are drawn by several threads."""
-
-_SHIFT = 4
-TILE_PX = 1 << _SHIFT
-"""Side of the square tiles in which changes are booked."""
-
-_PLAIN, _BRIDGE, _OUTSIDE = 0, 1, 2
-"""Kinds of triangles: linear, spanning a hole or a step, outside of the hull."""
-
-_SURE = 1e-6
-
-Whole = int | np.int32 | np.int64
-
-
-class Layers(NamedTuple):
-    """What is known at every pixel, arrays of shape (height, width).
-
-    `touched` alone has a value for every tile of `TILE_PX` pixels a side.
-
-    Attributes
-    ----------
-    samples_mm : float32 array
-        Depth of the sample on the pixel, 0 where none returned.
-    nearest : int32 array
-        Nearest sample, as ``row * width + column``; -1 where there is none at all.
-    gap_sq : int32 array
-        Squared distance to it in pixels.
-    depth_mm : float32 array
-        The model.
-    plain : bool array
-        Whether it is linear there, on a triangle that bridges nothing; elsewhere it is the depth of
-        the nearest sample.
-    spread_mm2 : float32 array
-        Variance of the depths at the corners of the pixel's triangle; 0 outside the hull.
-    touched : bool array of shape (rows, columns)
-        Tiles in which, or beside which, a pixel may have changed since the reader cleared it.
-    """
-
-    samples_mm: Floats
-    nearest: Ints
-    gap_sq: Ints
-    depth_mm: Floats
-    plain: Bools
-    spread_mm2: Floats
-    touched: Bools
-
-
-class Points(NamedTuple):
-    """The samples as the triangulation has them: pixels (n, 2), column first, and depths (n,) in mm."""
-
-    uv: Ints
-    z_mm: Floats
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _touch(touched: Bools, top: Whole, left: Whole, bottom: Whole, right: Whole) -> None:
-    """Book a change of pixels in these rows and columns, which their neighbours may heed."""
-    rows, columns = touched.shape
-    first_row, last_row = max(top - 1, 0) >> _SHIFT, min((bottom + 1) >> _SHIFT, rows - 1)
-    first_column, last_column = max(left - 1, 0) >> _SHIFT, min((right + 1) >> _SHIFT, columns - 1)
-    touched[first_row, first_column] = touched[first_row, last_column] = True
-    touched[last_row, first_column] = touched[last_row, last_column] = True
-    if last_row - first_row > 1 or last_column - first_column > 1:
-        touched[first_row : last_row + 1, first_column : last_column + 1] = True
+MANY = 1000
+"""More triangles or points than this are worth a second thread."""
 
 
 @njit(cache=True, nogil=True)
@@ -129,142 +61,9 @@ def _claim(layers: Layers, uv: Ints) -> None:
                     layers.nearest[v, u] = name
                     if not layers.plain[v, u]:
                         layers.depth_mm[v, u] = z
-                _touch(layers.touched, v, first, v, last)
+                touch(layers.touched, v, first, v, last)
                 left, right = first, last
                 v += direction
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _bridges(uv: Ints, z_mm: Floats, a: int, b: int, c: int) -> bool:
-    """Whether a triangle of three points spans a hole or a depth step."""
-    if max(z_mm[a], z_mm[b], z_mm[c]) - min(z_mm[a], z_mm[b], z_mm[c]) <= STEP_MM:
-        return False
-    longest = max(
-        (uv[a, 0] - uv[b, 0]) ** 2 + (uv[a, 1] - uv[b, 1]) ** 2,
-        (uv[b, 0] - uv[c, 0]) ** 2 + (uv[b, 1] - uv[c, 1]) ** 2,
-        (uv[c, 0] - uv[a, 0]) ** 2 + (uv[c, 1] - uv[a, 1]) ** 2,
-    )
-    return bool(longest > BRIDGE_PX * BRIDGE_PX)
-
-
-@njit(cache=True, nogil=True)
-def _sort_out(changed: Bools, uv: Ints, z_mm: Floats, tri: Ints, kind: Bytes, drawn: Ints) -> int:
-    """Say of what kind each changed triangle is, and list those to be drawn; their number is returned."""
-    count = 0
-    for t in range(len(changed)):
-        if not changed[t]:
-            continue
-        changed[t] = False
-        a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
-        if a == GHOST or b == GHOST or c == GHOST:
-            kind[t] = _OUTSIDE
-            continue
-        kind[t] = _BRIDGE if _bridges(uv, z_mm, a, b, c) else _PLAIN
-        drawn[count] = t
-        count += 1
-    return count
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _draw_edge(layers: Layers, points: Points, a: int, b: int, plainly: bool, spread: np.float32) -> None:
-    """Draw the pixels between two points: to the last bit the same from either side.
-
-    `spread` is theirs too if it is not negative.
-    """
-    if a > b:
-        a, b = b, a
-    u, v = points.uv[a, 0], points.uv[a, 1]
-    du, dv = points.uv[b, 0] - u, points.uv[b, 1] - v
-    steps, rest = abs(du), abs(dv)
-    while rest:
-        steps, rest = rest, steps % rest
-    width = layers.depth_mm.shape[1]
-    z, rise = points.z_mm[a], points.z_mm[b] - points.z_mm[a]
-    for step in range(1, steps):
-        x, y = u + du // steps * step, v + dv // steps * step
-        near = layers.nearest[y, x]
-        layers.plain[y, x] = plainly
-        layers.depth_mm[y, x] = (
-            z + rise * np.float64(step) / np.float64(steps) if plainly else layers.samples_mm[near // width, near % width]
-        )
-        if spread >= 0:
-            layers.spread_mm2[y, x] = spread
-
-
-@njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def _fill(layers: Layers, points: Points, a: int, b: int, c: int, bridge: bool, spread: np.float32) -> None:
-    """Draw a triangle's inside, its right edges, and its upper one if that is level.
-
-    So each pixel of an edge is drawn by one of its two triangles.
-    """
-    uv, z_mm = points.uv, points.z_mm
-    if uv[b, 1] < uv[a, 1]:
-        a, b = b, a
-    if uv[c, 1] < uv[b, 1]:
-        b, c = c, b
-        if uv[b, 1] < uv[a, 1]:
-            a, b = b, a
-    # Now from top to bottom: a row crosses the edge ac and one of the others.
-    u0, v0, u1, v1 = np.int64(uv[a, 0]), np.int64(uv[a, 1]), np.int64(uv[b, 0]), np.int64(uv[b, 1])
-    u2, v2 = np.int64(uv[c, 0]), np.int64(uv[c, 1])
-    area = np.float64((u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0))
-    z0, z01, z02 = np.float64(z_mm[a]), np.float64(z_mm[b] - z_mm[a]), np.float64(z_mm[c] - z_mm[a])
-    along, down = (z01 * (v2 - v0) - z02 * (v1 - v0)) / area, (z02 * (u1 - u0) - z01 * (u2 - u0)) / area
-    # Crossings are whole or at least 1 / height from it: a little more, and none is cut off.
-    ac, ab, bc = (u2 - u0) / (v2 - v0), (u1 - u0) / max(v1 - v0, 1), (u2 - u1) / max(v2 - v1, 1)
-    width = layers.depth_mm.shape[1]
-    for v in range(v0, v2):
-        long = int(u0 + (v - v0) * ac + _SURE)
-        short = int(u0 + (v - v0) * ab + _SURE) if v < v1 else int(u1 + (v - v1) * bc + _SURE)
-        first, end = (short, long) if area < 0 else (long, short)
-        depth, plain, spreads = layers.depth_mm[v], layers.plain[v], layers.spread_mm2[v]
-        z = z0 + (v - v0) * down + (first + 1 - u0) * along
-        for u in range(np.uint64(first + 1), np.uint64(end + 1)):  # unsigned: none is counted from the end
-            spreads[u] = spread
-            plain[u] = not bridge
-            depth[u] = z
-            z += along
-        if bridge:
-            for u in range(first + 1, end + 1):
-                near = layers.nearest[v, u]
-                depth[u] = layers.samples_mm[near // width, near % width]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _draw(first: int, end: int, drawn: Ints, layers: Layers, points: Points, tri: Ints, adj: Ints, kind: Bytes) -> None:
-    """Draw triangles into the model: those that bridge nothing linearly, the others not at all.
-
-    Pixels on the edge that a bridge shares with a plain triangle are the plain one's, and a sample
-    counts as plain. So whichever triangle is drawn last, the model is the same.
-    """
-    uv, z_mm = points.uv, points.z_mm
-    for t in drawn[first:end]:
-        a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
-        z0, z1, z2 = z_mm[a], z_mm[b], z_mm[c]
-        mean = (z0 + z1 + z2) / np.float32(3)
-        spread = ((z0 - mean) ** 2 + (z1 - mean) ** 2 + (z2 - mean) ** 2) / np.float32(3)
-        bridge = kind[t] == _BRIDGE
-        _touch(
-            layers.touched, min(uv[a, 1], uv[b, 1], uv[c, 1]), min(uv[a, 0], uv[b, 0], uv[c, 0]),
-            max(uv[a, 1], uv[b, 1], uv[c, 1]), max(uv[a, 0], uv[b, 0], uv[c, 0]),
-        )  # fmt: skip
-        _fill(layers, points, a, b, c, bridge, spread)
-        for k in range(3):
-            other = kind[adj[t, k]]
-            if other == _PLAIN and not bridge:
-                continue
-            begin, stop = tri[t, NEXT[k]], tri[t, NEXT[k + 1]]
-            du, dv = uv[stop, 0] - uv[begin, 0], uv[stop, 1] - uv[begin, 1]
-            filled = dv > 0 or (dv == 0 and du > 0)
-            if other == _OUTSIDE and not filled:
-                _draw_edge(layers, points, begin, stop, not bridge, spread)
-            elif (other == _PLAIN and filled) or (other == _BRIDGE and not filled):
-                _draw_edge(layers, points, begin, stop, not bridge or other == _PLAIN, np.float32(-1))
-        for p in (a, b, c):
-            u, v = uv[p, 0], uv[p, 1]
-            layers.plain[v, u] = True
-            layers.depth_mm[v, u] = z_mm[p]
-            layers.spread_mm2[v, u] = 0
 
 
 @njit(cache=True, nogil=True)
@@ -286,7 +85,7 @@ def _renew_far(layers: Layers) -> None:
                 z = layers.samples_mm[near // width, near % width]
                 if z != layers.depth_mm[v, u]:
                     layers.depth_mm[v, u] = z
-                    _touch(layers.touched, v, u, v, u)
+                    touch(layers.touched, v, u, v, u)
 
 
 class Surface:
@@ -297,7 +96,7 @@ class Surface:
     shape : tuple of int
         Height and width of the image in pixels.
     threads : int, optional
-        Kernel threads of the first `add`; default `default_threads()`. Later ones use one.
+        Kernel threads; default `default_threads()`. The result does not depend on it.
 
     Attributes
     ----------
@@ -361,19 +160,30 @@ class Surface:
         uv, mm = np.ascontiguousarray(uv[returned], np.int32), mm[returned]
         if not len(uv):
             return
-        layers, first = self.layers, not len(self._uv)
         self._point[uv[:, 1], uv[:, 0]] = np.arange(len(self._uv), len(self._uv) + len(uv))
         self._uv = np.concatenate((self._uv, uv))
         self._depth_mm = np.concatenate((self._depth_mm, mm))
-        layers.samples_mm[uv[:, 1], uv[:, 0]] = mm
-        if first:  # one by one, the first of many samples would claim whole images
-            layers.nearest[:], layers.gap_sq[:] = nearest_sample(layers.samples_mm > 0, self._threads)
-            layers.depth_mm[:] = layers.samples_mm.ravel()[layers.nearest]
-            layers.touched[:] = True
-        else:
+        self.layers.samples_mm[uv[:, 1], uv[:, 0]] = mm
+        at_once(partial(self._tell_nearest, uv), partial(self._triangulate, uv), threads=self._threads_for(len(uv)))
+
+    def _threads_for(self, work: int) -> int | None:
+        """To begin a thread takes as long as some hundred triangles or points."""
+        return self._threads if work > MANY else 1
+
+    def _tell_nearest(self, uv: Ints) -> None:
+        """Tell every pixel which sample is nearest."""
+        layers = self.layers
+        if len(uv) < len(self._uv):
             _claim(layers, uv)
+        else:  # one by one, the first of many samples would claim whole images
+            nearest_sample(layers.samples_mm > 0, 1, into=(layers.nearest, layers.gap_sq))
+            np.take(layers.samples_mm, layers.nearest, out=layers.depth_mm, mode="clip")
+            layers.touched[:] = True
+
+    def _triangulate(self, uv: Ints) -> None:
+        """Take new points into the mesh."""
         if self._mesh is None:
-            self._mesh = Mesh.of(self._uv, 2 * len(self._uv), layers.depth_mm.shape)
+            self._mesh = Mesh.of(self._uv, 2 * len(self._uv), self.layers.depth_mm.shape)
         else:
             self._mesh.add(uv)
 
@@ -386,6 +196,5 @@ class Surface:
             self._kind = np.pad(self._kind, (0, len(mesh.tri) - len(self._kind)))
         drawn = np.empty(mesh.triangles, np.int32)
         points = Points(mesh.uv, self._depth_mm)
-        count = _sort_out(mesh.changed[: mesh.triangles], *points, mesh.tri, self._kind, drawn)
-        threads = self._threads if count > MANY_TRIANGLES else 1  # to begin some would take longer
-        in_bands(_draw, count, threads, drawn, layers, points, mesh.tri, mesh.adj, self._kind)
+        count = sort_out(mesh.changed[: mesh.triangles], *points, mesh.tri, self._kind, drawn)
+        in_bands(draw, count, self._threads_for(count), drawn, layers, points, mesh.tri, mesh.adj, self._kind)
