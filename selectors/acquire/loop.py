@@ -212,8 +212,8 @@ def _allowed(uv: npt.ArrayLike, samples: Samples, left: int) -> Ints:
     pixels = pixels_in(uv, samples.frame_shape, "the plan's pixels")
     if len(pixels) > left or not samples.all_new(pixels):
         raise ValueError(
-            f"the selector's plan asks for {len(pixels)} pixels where {left} are left, or for a pixel twice, or for some"
-            " that are measured already"
+            f"the selector's plan asks for {len(pixels)} pixels where {left} are left, or for a pixel twice, or for"
+            " some that are measured already"
         )
     return pixels
 

@@ -150,25 +150,34 @@ def insert(uv: Ints, tri: Ints, adj: Ints, count: int, p: int, t: int, stack: In
 
 
 @njit(cache=True, nogil=True)
-def settle(uv: Ints, tri: Ints, adj: Ints, count: int) -> None:
-    """Turn edges of a triangulation of any kind, with its ghosts, until every disk is empty."""
-    stack = np.empty(64, np.int32)
+def settle(uv: Ints, tri: Ints, adj: Ints, count: int, sure: Bools) -> None:
+    """Turn edges of a triangulation of any kind, with its ghosts, until every disk is empty.
+
+    Between two triangles that are `sure`, the edge is known to be right.
+    """
+    stack, waits = np.empty(count + 1, np.int32), np.zeros(count, np.bool_)
     for newest in range(count):
         stack[0] = newest
         top = 1
         while top > 0:
             top -= 1
             t = stack[top]
-            for k in range(3):
+            waits[t] = False
+            k = 0
+            while k < 3:
                 o, p = adj[t, k], tri[t, k]
                 # An edge is looked at when the later of its triangles comes. Hull edges stay.
-                if p == GHOST or max(o, t) > newest or not in_disk(uv, tri[o, 0], tri[o, 1], tri[o, 2], p):
+                if p == GHOST or o > newest or t > newest or (sure[o] and sure[t]):
+                    k += 1
+                    continue
+                if not in_disk(uv, tri[o, 0], tri[o, 1], tri[o, 2], p):
+                    k += 1
                     continue
                 for rows in (tri, adj):  # so that p is corner 0
                     rows[t, 0], rows[t, 1], rows[t, 2] = rows[t, k], rows[t, NEXT[k]], rows[t, NEXT[k + 1]]
                 _flip(tri, adj, t, o)
-                if top + 2 > len(stack):
-                    stack = np.append(stack, stack)
-                stack[top], stack[top + 1] = t, o
-                top += 2
-                break
+                sure[o] = sure[t] = False
+                if not waits[o]:
+                    stack[top], waits[o] = o, True
+                    top += 1
+                k = 0

@@ -49,6 +49,7 @@ def zip_rows(uv: Ints, starts: Longs, tri: Ints, adj: Ints) -> int:
     bottom = right + strips
     left = bottom + bottom_edges
     above = np.empty(n, np.int32)  # triangle above the edge from each point to its row's next
+    sure = np.zeros(real + outline + 1, np.bool_)  # halves of a lattice's cells
     t = 0
     for strip in range(strips):
         a, b = starts[strip], starts[strip + 1]
@@ -61,6 +62,7 @@ def zip_rows(uv: Ints, starts: Longs, tri: Ints, adj: Ints) -> int:
             if u_a == u_b:  # the corners of a cell: the diagonal that `in_disk` will keep
                 u, upper, lower = uv[b, 0], uv[a, 1], uv[b, 1]
                 along_a = height(u_a, upper) + height(u, lower) < height(u, upper) + height(u_b, lower)
+                sure[t] = sure[t + 1] = uv[a, 0] == u
             tri[t, 0], tri[t, 1], tri[t, 2] = a, (a if along_a else b) + 1, b
             if before < 0:
                 _haunt(tri, adj, t, 1, left + strips - 1 - strip)
@@ -83,5 +85,5 @@ def zip_rows(uv: Ints, starts: Longs, tri: Ints, adj: Ints) -> int:
     for i in range(outline):
         adj[real + i, 0] = real + (i - 1) % outline
         adj[real + i, 1] = real + (i + 1) % outline
-    settle(uv, tri, adj, real + outline)
+    settle(uv, tri, adj, real + outline, sure)
     return int(real + outline)
