@@ -121,9 +121,10 @@ def best_pixels(worth: Floats, shots: int, *, crowded: float = CROWDED, threads:
     """As `choose`, of a map known to be float32, whole in memory and nowhere negative or NaN."""
     # Most pixels are out of the question: a sample of them says where to draw a safe line.
     some = worth.ravel()[::_SAMPLED]
-    rank = 5 * shots // (2 * _SAMPLED)
-    least = float(np.partition(some, len(some) - rank)[-rank]) if 0 < rank < len(some) else 0.0
-    uv = _best(worth, shots, least, crowded, threads)
-    if len(uv) < shots and least > 0:
-        uv = _best(worth, shots, 0.0, crowded, threads)
-    return uv
+    rank = 3 * shots // _SAMPLED
+    while True:
+        least = float(np.partition(some, len(some) - rank)[-rank]) if 0 < rank < len(some) else 0.0
+        uv = _best(worth, shots, least, crowded, threads)
+        if len(uv) == shots or least <= 0:
+            return uv
+        rank *= 2
