@@ -80,9 +80,10 @@ def pixels_in(uv: npt.ArrayLike, shape: tuple[int, int], name: str = "uv") -> In
     if np.ma.getmask(uv).any():
         raise ValueError(f"{name} has masked elements; leave out the pixels that are not meant")
     if len(given):
-        low, high = given.min(axis=0), given.max(axis=0)
-        if low.min() < 0 or high[0] >= width or high[1] >= height:
-            swapped = low.min() >= 0 and high[1] < width and high[0] < height
+        # Column by column: along the other axis it takes 30 times as long.
+        low, high = ([end(given[:, axis]) for axis in (0, 1)] for end in (np.min, np.max))
+        if min(low) < 0 or high[0] >= width or high[1] >= height:
+            swapped = min(low) >= 0 and high[1] < width and high[0] < height
             raise ValueError(
                 f"a pixel of {name} lies outside the frame of {width}x{height} pixels: columns"
                 f" {low[0]} to {high[0]}, rows {low[1]} to {high[1]}"

@@ -24,8 +24,8 @@ from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.selection import Selection
 from selective_depth.selectors.triangulation import FAR_SQ, TILE_PX, Layers, Surface
 
-_FLAT = np.float32(1e-3)
-"""Slope where the model has none, mm per pixel: what is left of a budget spreads by it."""
+_FLAT_SQ = np.float32(1e-6)
+"""Square of the slope where the model has none, mm per pixel: what is left of a budget spreads by it."""
 
 
 @njit(cache=True, nogil=True)
@@ -61,8 +61,8 @@ def _score_tiles(
     columns = layers.touched.shape[1]
     depth = layers.depth_mm
     here = np.empty(width + 2, np.float32)  # a run of a row and a pixel on either side
-    apart = np.full(width, 2, np.float32)  # between the columns that tell a slope
-    apart[0] = apart[-1] = 1
+    inverse_du = np.full(width, 0.5, np.float32)  # of the columns that tell a slope
+    inverse_du[0] = inverse_du[-1] = 1
     at = first
     while at < end:
         tile = tiles[at]
@@ -71,23 +71,22 @@ def _score_tiles(
         while at < end and tiles[at] == tiles[at - 1] + 1 and tiles[at] % columns:
             at += 1  # neighbours in a row are one run
         stop = min((tiles[at - 1] % columns + 1) * TILE_PX, width)
-        run, spans = stop - left, apart[left:stop]
+        run, per_px = stop - left, inverse_du[left:stop]
         for v in range(top, min(top + TILE_PX, height)):
             above, below = max(v - 1, 0), min(v + 1, height - 1)
             upper, lower = depth[above, left:stop], depth[below, left:stop]
-            rows_apart = np.float32(max(below - above, 1))
+            per_row = np.float32(1 / max(below - above, 1))
             here[0], here[run + 1] = depth[v, max(left - 1, 0)], depth[v, min(stop, width - 1)]
             here[1 : run + 1] = depth[v, left:stop]
             known, near_sq, missed_sq = image_mm[v, left:stop], layers.gap_sq[v, left:stop], miss_sq[v, left:stop]
             spread_mm2, scores = layers.spread_mm2[v, left:stop], score[v, left:stop]
             for k in range(run):  # without a branch, it is computed for many pixels at once
-                along, down = (here[k + 2] - here[k]) / spans[k], (lower[k] - upper[k]) / rows_apart
-                slope = max(np.sqrt(along * along + down * down), _FLAT)
-                gap_sq = np.float32(near_sq[k])
-                rise_mm = slope * np.sqrt(gap_sq)
+                along, down = (here[k + 2] - here[k]) * per_px[k], (lower[k] - upper[k]) * per_row
+                gap_sq, miss = np.float32(near_sq[k]), np.float32(missed_sq[k])
+                rise_sq = max(along * along + down * down, _FLAT_SQ) * gap_sq
                 spread_mm = np.sqrt(spread_mm2[k] + noise_mm2)
-                nearness = gap_sq / np.float32(missed_sq[k])
-                worth = rise_mm * np.sqrt(spread_mm) / (np.float32(1) + nearness * nearness)
+                # P(return) with both distances' fourth powers, so that one division does.
+                worth = np.sqrt(rise_sq * spread_mm) * (miss * miss) / (miss * miss + gap_sq * gap_sq)
                 scores[k] = worth if known[k] == 0 and gap_sq <= reach_sq else np.float32(0)
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Bools, Floats, Ints
@@ -23,6 +22,21 @@ from selective_depth.selectors.triangulation.nearest import FAR_SQ, nearest_samp
 
 MANY = 1000
 """More triangles or points than this are worth a second thread."""
+
+
+@njit(cache=True, nogil=True)
+def _take_in(
+    uv: Ints, depth_mm: Floats, samples_mm: Floats, point: Ints, first: int, kept_uv: Ints, kept_mm: Floats
+) -> int:
+    """Book the samples that returned, numbered from `first` on, and list them; how many is returned."""
+    count = 0
+    for i in range(len(uv)):
+        if depth_mm[i] > 0:
+            u, v = uv[i]
+            samples_mm[v, u] = kept_mm[count] = depth_mm[i]
+            kept_uv[count, 0], kept_uv[count, 1], point[v, u] = u, v, first + count
+            count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)
@@ -127,7 +141,7 @@ class Surface:
         """How many samples it holds."""
         return len(self._uv)
 
-    def add(self, uv: Ints, depth_mm: npt.NDArray[np.generic]) -> None:
+    def add(self, uv: Ints, depth_mm: Floats) -> None:
         """Take in samples: pixels (n, 2), column first, none given before, and depth (n,) in mm.
 
         Those without depth (0 or negative) are left out.
@@ -153,17 +167,15 @@ class Surface:
         if differ.any():
             _renew_far(self.layers)
 
-    def _insert(self, uv: Ints, depth_mm: npt.NDArray[np.generic]) -> None:
+    def _insert(self, uv: Ints, depth_mm: Floats) -> None:
         """Take in samples without drawing them."""
-        mm = depth_mm.astype(np.float32)
-        returned = mm > 0
-        uv, mm = np.ascontiguousarray(uv[returned], np.int32), mm[returned]
-        if not len(uv):
+        returned = np.empty((len(uv), 2), np.int32), np.empty(len(uv), np.float32)
+        count = _take_in(uv, depth_mm, self.layers.samples_mm, self._point, len(self._uv), *returned)
+        if not count:
             return
-        self._point[uv[:, 1], uv[:, 0]] = np.arange(len(self._uv), len(self._uv) + len(uv))
+        uv = returned[0][:count]
         self._uv = np.concatenate((self._uv, uv))
-        self._depth_mm = np.concatenate((self._depth_mm, mm))
-        self.layers.samples_mm[uv[:, 1], uv[:, 0]] = mm
+        self._depth_mm = np.concatenate((self._depth_mm, returned[1][:count]))
         at_once(partial(self._tell_nearest, uv), partial(self._triangulate, uv), threads=self._threads_for(len(uv)))
 
     def _threads_for(self, work: int) -> int | None:
