@@ -85,6 +85,12 @@ def touch(touched: Bools, top: Whole, left: Whole, bottom: Whole, right: Whole) 
 
 
 @njit(cache=True, nogil=True, inline="always")
+def _after(uv: Ints, a: int, b: int) -> bool:
+    """Whether b comes before a, row by row: what is drawn in that order is so to the last bit."""
+    return bool(uv[a, 1] > uv[b, 1] or (uv[a, 1] == uv[b, 1] and uv[a, 0] > uv[b, 0]))
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _bridges(uv: Ints, z_mm: Floats, a: int, b: int, c: int) -> bool:
     """Whether a triangle of three points spans a hole or a depth step."""
     if max(z_mm[a], z_mm[b], z_mm[c]) - min(z_mm[a], z_mm[b], z_mm[c]) <= STEP_MM:
@@ -121,7 +127,7 @@ def _draw_edge(layers: Layers, points: Points, a: int, b: int, plainly: bool, sp
 
     `spread` is theirs too if it is not negative.
     """
-    if a > b:
+    if _after(points.uv, a, b):
         a, b = b, a
     u, v = points.uv[a, 0], points.uv[a, 1]
     du, dv = points.uv[b, 0] - u, points.uv[b, 1] - v
@@ -144,17 +150,18 @@ def _draw_edge(layers: Layers, points: Points, a: int, b: int, plainly: bool, sp
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def _fill(layers: Layers, points: Points, a: int, b: int, c: int, bridge: bool, spread: np.float32) -> None:
+def _fill(layers: Layers, points: Points, a: int, b: int, c: int, bridge: bool) -> np.float32:
     """Draw a triangle's inside, its right edges, and its upper one if that is level.
 
-    So each pixel of an edge is drawn by one of its two triangles.
+    So each pixel of an edge is drawn by one of its two triangles. The variance of the corners'
+    depths is returned.
     """
     uv, z_mm = points.uv, points.z_mm
-    if uv[b, 1] < uv[a, 1]:
+    if _after(uv, a, b):
         a, b = b, a
-    if uv[c, 1] < uv[b, 1]:
+    if _after(uv, b, c):
         b, c = c, b
-        if uv[b, 1] < uv[a, 1]:
+        if _after(uv, a, b):
             a, b = b, a
     # Now from top to bottom: a row crosses the edge ac and one of the others.
     u0, v0, u1, v1 = np.int64(uv[a, 0]), np.int64(uv[a, 1]), np.int64(uv[b, 0]), np.int64(uv[b, 1])
@@ -162,6 +169,8 @@ def _fill(layers: Layers, points: Points, a: int, b: int, c: int, bridge: bool, 
     area = np.float64((u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0))
     z0, z01, z02 = np.float64(z_mm[a]), np.float64(z_mm[b] - z_mm[a]), np.float64(z_mm[c] - z_mm[a])
     along, down = (z01 * (v2 - v0) - z02 * (v1 - v0)) / area, (z02 * (u1 - u0) - z01 * (u2 - u0)) / area
+    mean = (z_mm[a] + z_mm[b] + z_mm[c]) / np.float32(3)
+    spread = ((z_mm[a] - mean) ** 2 + (z_mm[b] - mean) ** 2 + (z_mm[c] - mean) ** 2) / np.float32(3)
     # Crossings are whole or at least 1 / height from it: a little more, and none is cut off.
     ac, ab, bc = (u2 - u0) / (v2 - v0), (u1 - u0) / max(v1 - v0, 1), (u2 - u1) / max(v2 - v1, 1)
     width = layers.depth_mm.shape[1]
@@ -180,6 +189,7 @@ def _fill(layers: Layers, points: Points, a: int, b: int, c: int, bridge: bool, 
             for u in range(first + 1, end + 1):
                 near = layers.nearest[v, u]
                 depth[u] = layers.samples_mm[near // width, near % width]
+    return np.float32(spread)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -192,15 +202,12 @@ def draw(first: int, end: int, drawn: Ints, layers: Layers, points: Points, tri:
     uv, z_mm = points.uv, points.z_mm
     for t in drawn[first:end]:
         a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
-        z0, z1, z2 = z_mm[a], z_mm[b], z_mm[c]
-        mean = (z0 + z1 + z2) / np.float32(3)
-        spread = ((z0 - mean) ** 2 + (z1 - mean) ** 2 + (z2 - mean) ** 2) / np.float32(3)
         bridge = kind[t] == _BRIDGE
         touch(
             layers.touched, min(uv[a, 1], uv[b, 1], uv[c, 1]), min(uv[a, 0], uv[b, 0], uv[c, 0]),
             max(uv[a, 1], uv[b, 1], uv[c, 1]), max(uv[a, 0], uv[b, 0], uv[c, 0]),
         )  # fmt: skip
-        _fill(layers, points, a, b, c, bridge, spread)
+        spread = _fill(layers, points, a, b, c, bridge)
         for k in range(3):
             other = kind[adj[t, k]]
             if other == _PLAIN and not bridge:

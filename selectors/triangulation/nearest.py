@@ -96,7 +96,7 @@ def nearest_sample(
     -------
     nearest : int32 array of shape (H, W)
         Its pixel, as ``row * W + column``; -1 where there is no sample at all. Of equally near
-        samples, any one.
+        samples, the one farthest to the left; of those above each other, the upper one.
     gap_sq : int32 array of shape (H, W)
         Squared distance to it in pixels; `FAR_SQ` where there is none.
 

@@ -39,6 +39,17 @@ def _take_in(
     return count
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _nearer(layers: Layers, v: int, u: int, v0: int, u0: int) -> bool:
+    """Is a pixel nearer to the sample at (u0, v0) than to its nearest? Of two, the left or upper one is."""
+    gap_sq = (u - u0) * (u - u0) + (v - v0) * (v - v0)
+    if gap_sq != layers.gap_sq[v, u]:
+        return bool(gap_sq < layers.gap_sq[v, u])
+    width = layers.gap_sq.shape[1]
+    row, column = layers.nearest[v, u] // width, layers.nearest[v, u] % width
+    return bool(u0 < column or (u0 == column and v0 < row))
+
+
 @njit(cache=True, nogil=True)
 def _claim(layers: Layers, uv: Ints) -> None:
     """Give every new sample the pixels that lie nearer to it than to any other.
@@ -46,8 +57,7 @@ def _claim(layers: Layers, uv: Ints) -> None:
     They form a convex region about the sample: in each row one run, which touches that of the
     row before.
     """
-    gap_sq = layers.gap_sq
-    height, width = gap_sq.shape
+    height, width = layers.gap_sq.shape
     for i in range(len(uv)):
         u0, v0 = uv[i, 0], uv[i, 1]
         name = v0 * width + u0
@@ -56,22 +66,18 @@ def _claim(layers: Layers, uv: Ints) -> None:
             left, right = u0, u0
             v = v0 if direction < 0 else v0 + 1
             while 0 <= v < height:
-                dv_sq = (v - v0) * (v - v0)
                 first, last = width, -1
-                u = max(left - 1, 0)
-                while u < width and u <= right + 1:
-                    if (u - u0) * (u - u0) + dv_sq < gap_sq[v, u]:
-                        first = min(first, u)
-                        last = u
-                    u += 1
+                for u in range(max(left - 1, 0), min(right + 2, width)):
+                    if _nearer(layers, v, u, v0, u0):
+                        first, last = min(first, u), u
                 if last < 0:
                     break
-                while first > 0 and (first - 1 - u0) ** 2 + dv_sq < layers.gap_sq[v, first - 1]:
+                while first > 0 and _nearer(layers, v, first - 1, v0, u0):
                     first -= 1
-                while last < width - 1 and (last + 1 - u0) ** 2 + dv_sq < layers.gap_sq[v, last + 1]:
+                while last < width - 1 and _nearer(layers, v, last + 1, v0, u0):
                     last += 1
                 for u in range(first, last + 1):
-                    gap_sq[v, u] = (u - u0) * (u - u0) + dv_sq
+                    layers.gap_sq[v, u] = (u - u0) * (u - u0) + (v - v0) * (v - v0)
                     layers.nearest[v, u] = name
                     if not layers.plain[v, u]:
                         layers.depth_mm[v, u] = z

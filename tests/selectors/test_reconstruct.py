@@ -15,6 +15,7 @@ from selective_depth.selectors.triangulation import BRIDGE_PX, STEP_MM, nearest_
 from selective_depth.selectors.triangulation.delaunay import Mesh
 from selective_depth.selectors.triangulation.flips import GHOST
 from selective_depth.selectors.triangulation.nearest import FAR_SQ
+from selective_depth.selectors.triangulation.rows import row_starts
 
 Pixels = npt.NDArray[np.int32]
 
@@ -90,6 +91,47 @@ def test_a_lattice_is_triangulated_without_slivers_or_gaps() -> None:
     assert len(triangles) == 2 * 127 * 127
     assert set(np.unique(doubled_areas(uv, triangles))) == {15, 20}  # half a 5x3 or 5x4 cell
     assert (mesh.tri[: mesh.triangles] == GHOST).any()
+
+
+@st.composite
+def rows_with_holes(draw: st.DrawFn) -> Pixels:
+    """A lattice of any steps, some or many of whose points are missing."""
+    columns, rows = (np.cumsum(draw(st.lists(st.integers(1, 9), min_size=2, max_size=14))) for _ in range(2))
+    u, v = np.meshgrid(columns, rows)
+    uv = np.stack((u, v), axis=-1).reshape(-1, 2).astype(np.int32)
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    return uv[rng.random(len(uv)) < draw(st.sampled_from([1.0, 0.95, 0.7, 0.4]))]
+
+
+@settings(max_examples=120, deadline=None)
+@given(rows_with_holes())
+def test_rows_zipped_together_are_the_triangulation_of_points_one_by_one(uv: Pixels) -> None:
+    """There is one, even of points on circles: `in_disk` decides by a hash."""
+    one_by_one = Mesh.of(np.random.default_rng(0).permutation(uv))
+    zipped = Mesh.of(uv)
+    if zipped is None:
+        assert one_by_one is None
+        return
+    assert_delaunay(uv, zipped)
+    assert one_by_one is not None
+    assert corners_of(zipped) == corners_of(one_by_one)
+
+
+def corners_of(mesh: Mesh) -> set[frozenset[tuple[int, int]]]:
+    """Its triangles as sets of pixels."""
+    return {frozenset((int(u), int(v)) for u, v in mesh.uv[corners]) for corners in mesh.real_triangles()}
+
+
+def test_full_lattices_and_most_with_holes_are_zipped() -> None:
+    """Else the test above would hold one by one against one by one."""
+    uv = SeedGrid.from_array(np.full((480, 640), 1000), (128, 128)).lattice_uv.reshape(-1, 2)
+    kept = np.random.default_rng(1).random(len(uv)) < 0.8
+    for points in (uv, uv[kept]):
+        starts = row_starts(points)
+        assert starts is not None
+        assert len(starts) == 129
+    assert row_starts(uv[::-1]) is None
+    assert row_starts(uv[::300]) is None
 
 
 def nearest_reference(valid: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:

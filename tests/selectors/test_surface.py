@@ -76,6 +76,16 @@ def test_the_model_is_that_of_its_triangles_however_the_samples_came(case: Case)
     np.testing.assert_array_equal(layers.gap_sq, distance.min(axis=-1))
 
 
+@settings(max_examples=80, deadline=None)
+@given(batches())
+def test_in_whatever_order_and_batches_samples_come_all_is_the_same_to_the_last_bit(case: Case) -> None:
+    shape, uv, depth_mm, _ = case
+    ordered = np.lexsort((uv[:, 0], uv[:, 1]))
+    at_once = filled((shape, uv[ordered], depth_mm[ordered], []))
+    for layer, same in zip(filled(case).layers[:-1], at_once.layers[:-1], strict=True):
+        np.testing.assert_array_equal(layer, same)
+
+
 @settings(max_examples=40, deadline=None)
 @given(batches())
 def test_the_spread_is_the_variance_of_a_triangle_s_corners(case: Case) -> None:
