@@ -24,6 +24,11 @@ MANY = 1000
 """More triangles or points than this are worth a second thread."""
 
 
+_THIN_PX = 5
+"""A region is looked for in one more row beyond its end for so many that it is high: none nearer
+than 13 pixels is known to have a gap."""
+
+
 @njit(cache=True, nogil=True)
 def _take_in(
     uv: Ints, depth_mm: Floats, samples_mm: Floats, point: Ints, first: int, kept_uv: Ints, kept_mm: Floats
@@ -40,13 +45,12 @@ def _take_in(
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _nearer(layers: Layers, v: int, u: int, v0: int, u0: int) -> bool:
+def _nearer(gap_sq: Ints, nearest: Ints, v: int, u: int, v0: int, u0: int) -> bool:
     """Is a pixel nearer to the sample at (u0, v0) than to its nearest? Of two, the left or upper one is."""
-    gap_sq = (u - u0) * (u - u0) + (v - v0) * (v - v0)
-    if gap_sq != layers.gap_sq[v, u]:
-        return bool(gap_sq < layers.gap_sq[v, u])
-    width = layers.gap_sq.shape[1]
-    row, column = layers.nearest[v, u] // width, layers.nearest[v, u] % width
+    here_sq, known_sq = (u - u0) * (u - u0) + (v - v0) * (v - v0), gap_sq[v, u]
+    if here_sq != known_sq:
+        return bool(here_sq < known_sq)
+    row, column = nearest[v, u] // gap_sq.shape[1], nearest[v, u] % gap_sq.shape[1]
     return bool(u0 < column or (u0 == column and v0 < row))
 
 
@@ -54,31 +58,35 @@ def _nearer(layers: Layers, v: int, u: int, v0: int, u0: int) -> bool:
 def _claim(layers: Layers, uv: Ints) -> None:
     """Give every new sample the pixels that lie nearer to it than to any other.
 
-    They form a convex region about the sample: in each row one run, which touches that of the
-    row before.
+    They form a convex region about the sample: in each row one run, which touches that of the row
+    before. Far from all samples it may be so thin that it passes between the pixels of a row or two.
     """
-    height, width = layers.gap_sq.shape
+    gap_sq, nearest = layers.gap_sq, layers.nearest
+    height, width = gap_sq.shape
     for i in range(len(uv)):
         u0, v0 = uv[i, 0], uv[i, 1]
         name = v0 * width + u0
         z = layers.samples_mm[v0, u0]
         for direction in (-1, 1):
-            left, right = u0, u0
+            left, right, passed = u0, u0, 0
             v = v0 if direction < 0 else v0 + 1
             while 0 <= v < height:
                 first, last = width, -1
                 for u in range(max(left - 1, 0), min(right + 2, width)):
-                    if _nearer(layers, v, u, v0, u0):
+                    if _nearer(gap_sq, nearest, v, u, v0, u0):
                         first, last = min(first, u), u
                 if last < 0:
-                    break
-                while first > 0 and _nearer(layers, v, first - 1, v0, u0):
+                    if passed == abs(v - v0) // _THIN_PX:
+                        break
+                    passed, left, right, v = passed + 1, left - 1, right + 1, v + direction
+                    continue
+                while first > 0 and _nearer(gap_sq, nearest, v, first - 1, v0, u0):
                     first -= 1
-                while last < width - 1 and _nearer(layers, v, last + 1, v0, u0):
+                while last < width - 1 and _nearer(gap_sq, nearest, v, last + 1, v0, u0):
                     last += 1
                 for u in range(first, last + 1):
-                    layers.gap_sq[v, u] = (u - u0) * (u - u0) + (v - v0) * (v - v0)
-                    layers.nearest[v, u] = name
+                    gap_sq[v, u] = (u - u0) * (u - u0) + (v - v0) * (v - v0)
+                    nearest[v, u] = name
                     if not layers.plain[v, u]:
                         layers.depth_mm[v, u] = z
                 touch(layers.touched, v, first, v, last)
