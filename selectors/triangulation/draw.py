@@ -87,7 +87,7 @@ def touch(touched: Bools, top: Whole, left: Whole, bottom: Whole, right: Whole) 
 @njit(cache=True, nogil=True, inline="always")
 def _after(uv: Ints, a: int, b: int) -> bool:
     """Whether b comes before a, row by row: what is drawn in that order is so to the last bit."""
-    return bool(uv[a, 1] > uv[b, 1] or (uv[a, 1] == uv[b, 1] and uv[a, 0] > uv[b, 0]))
+    return bool((uv[a, 1] << 16) + uv[a, 0] > (uv[b, 1] << 16) + uv[b, 0])  # with `or`, twice as slow
 
 
 @njit(cache=True, nogil=True, inline="always")
