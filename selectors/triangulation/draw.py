@@ -12,7 +12,7 @@ import numpy as np
 
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Bools, Bytes, Floats, Ints
-from selective_depth.selectors.triangulation.flips import GHOST, NEXT
+from selective_depth.selectors.triangulation.flips import GHOST, NEXT, Whole
 
 STEP_MM = 50.0
 """Depth span of a triangle's vertices above which it may bridge a hole or a step, millimetres."""
@@ -28,8 +28,6 @@ _PLAIN, _BRIDGE, _OUTSIDE = 0, 1, 2
 """Kinds of triangles: linear, spanning a hole or a step, outside of the hull."""
 
 _SURE = 1e-6
-
-Whole = int | np.int32 | np.int64
 
 
 class Layers(NamedTuple):
@@ -172,7 +170,7 @@ def _fill(layers: Layers, points: Points, a: int, b: int, c: int, bridge: bool) 
     mean = (z_mm[a] + z_mm[b] + z_mm[c]) / np.float32(3)
     spread = ((z_mm[a] - mean) ** 2 + (z_mm[b] - mean) ** 2 + (z_mm[c] - mean) ** 2) / np.float32(3)
     # Crossings are whole or at least 1 / height from it: a little more, and none is cut off.
-    ac, ab, bc = (u2 - u0) / (v2 - v0), (u1 - u0) / max(v1 - v0, 1), (u2 - u1) / max(v2 - v1, 1)
+    ac, ab, bc = (u2 - u0) / (v2 - v0), (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1)
     width = layers.depth_mm.shape[1]
     for v in range(v0, v2):
         long = int(u0 + (v - v0) * ac + _SURE)

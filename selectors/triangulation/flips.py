@@ -14,6 +14,8 @@ from selective_depth.selectors.arrays import Bools, Ints
 GHOST = -1
 """The vertex at infinity."""
 
+Whole = int | np.int32 | np.int64
+
 NEXT = np.array([1, 2, 0, 1], np.int64)
 """The corner after each, and after that."""
 
@@ -26,11 +28,11 @@ def orient(uv: Ints, a: int, b: int, c: int) -> int:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def height(u: int, v: int) -> int:
+def height(u: Whole, v: Whole) -> int:
     """A fixed hash of a pixel: the higher it is, the more it counts as outside of a circle it lies on."""
     h = (u * 0x9E3779B1 + v * 0x85EBCA77) & 0xFFFFFFFF
     h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
-    return h >> 16
+    return int(h >> 16)
 
 
 @njit(cache=True, nogil=True)

@@ -3,7 +3,8 @@
 A round of measurements touches a small part of a frame. So the triangulation, the nearest sample
 of every pixel and the model drawn from them are kept, and a batch of new samples costs what it
 changes: the triangles of the new points' stars are drawn again, and the pixels that lie nearest to
-a new sample are told so. The result is that of `selectors.reconstruct`, whatever the batches were.
+a new sample are told so. The result is that of `selectors.reconstruct`, whatever the batches
+were; but for a pixel, once in many frames, whose nearest samples are a dozen pixels off and alike.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ MANY = 1000
 
 
 _THIN_PX = 5
-"""A region is looked for in one more row beyond its end for so many that it is high: none nearer
-than 13 pixels is known to have a gap."""
+"""For so many rows that a region is high it is looked for in one more beyond its end. Farther than a
+dozen pixels from all samples, it may pass between the pixels of a row."""
 
 
 @njit(cache=True, nogil=True)
@@ -59,7 +60,7 @@ def _claim(layers: Layers, uv: Ints) -> None:
     """Give every new sample the pixels that lie nearer to it than to any other.
 
     They form a convex region about the sample: in each row one run, which touches that of the row
-    before. Far from all samples it may be so thin that it passes between the pixels of a row or two.
+    before.
     """
     gap_sq, nearest = layers.gap_sq, layers.nearest
     height, width = gap_sq.shape
