@@ -134,8 +134,8 @@ class Mesh:
         size = 2 * capacity
         tri, adj = np.empty((size, 3), np.int32), np.empty((size, 3), np.int32)
         extent_v, extent_u = extent_px or (int(points[:n, i].max()) + 1 for i in (1, 0))
-        # Four points a bin, on average: sparse points leave bins of 8 pixels empty.
-        shift = max(_LEAST_SHIFT, math.isqrt(4 * extent_u * extent_v // n).bit_length() - 1)
+        # Four to sixteen points a bin, on average: the last put in is the best start, if there is one.
+        shift = max(_LEAST_SHIFT, math.isqrt(4 * extent_u * extent_v // n).bit_length())
         bins = np.zeros((((extent_v - 1) >> shift) + 1, ((extent_u - 1) >> shift) + 1), np.int32)
         changed = np.ones(size, np.bool_)
         starts = row_starts(points[:n])
@@ -178,5 +178,6 @@ class Mesh:
     def real_triangles(self) -> Ints:
         """Vertices of the triangles inside the hull, shape (t, 3)."""
         tri = self.tri[: self.triangles]
-        real: Ints = tri[(tri != GHOST).all(axis=1)]
+        # One of three is the ghost, -1, if their bits in common are negative.
+        real: Ints = tri[(tri[:, 0] | tri[:, 1] | tri[:, 2]) >= 0]
         return real
