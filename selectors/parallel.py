@@ -12,6 +12,10 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from itertools import pairwise
 
+import numpy as np
+
+from selective_depth.selectors.arrays import Floats
+
 
 def default_threads() -> int:
     """Number of kernel threads: the processors this process may use, or SELECTIVE_DEPTH_THREADS."""
@@ -30,7 +34,9 @@ def _pool(process_id: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=max(default_threads(), 1), thread_name_prefix="kernel")
 
 
-def in_bands(kernel: Callable[..., object], rows: int, threads: int | None, *arguments: object) -> None:
+def in_bands(
+    kernel: Callable[..., object], rows: int, threads: int | None, *arguments: object, cost: Floats | None = None
+) -> None:
     """Call ``kernel(first_row, end_row, *arguments)`` over bands of rows, in parallel; wait for all.
 
     Parameters
@@ -43,9 +49,13 @@ def in_bands(kernel: Callable[..., object], rows: int, threads: int | None, *arg
         How many bands; None is `default_threads()`. 1 runs in the calling thread.
     *arguments
         What else the kernel takes.
+    cost : float array of shape (rows,), optional
+        How long each row takes beside the others, so that the bands take alike; default all alike.
     """
     count = max(min(threads or default_threads(), rows), 1)
-    edges = [rows * band // count for band in range(count + 1)]
+    shares = np.arange(1, count) / count
+    inner = shares * rows if cost is None else np.searchsorted(np.cumsum(cost), shares * cost.sum())
+    edges = 0, *inner.astype(int).tolist(), rows
     at_once(*(partial(kernel, *band, *arguments) for band in pairwise(edges)), threads=count)
 
 

@@ -18,6 +18,7 @@ from scipy.ndimage import maximum_filter
 from selective_depth.selectors.arrays import Bools, Floats, Ints
 from selective_depth.selectors.choice import choose
 from selective_depth.selectors.improvement.lattice import lattice_scratch
+from selective_depth.selectors.improvement.lattice_tables import SEEDS
 from selective_depth.selectors.improvement.map import (
     LEVEL_SHIFT,
     LEVELS,
@@ -35,6 +36,9 @@ from selective_depth.selectors.selection import Selection
 
 HALF_SCORE = 5e-4
 """Improvement, as a share of the mean depth of the seeds, that scores one half."""
+
+HOLED = 3.0
+"""How much longer a window with holes takes than one without."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +131,7 @@ class ImprovementSelector:
             lattice, scratch = windows.kernel_arguments, _scratch(windows)
             improvement_rows(first_row, end_row, padded, doubtful, half, lattice, scratch, histogram, maps, known)
 
-        in_bands(band, len(known), self.threads)
+        in_bands(band, len(known), self.threads, cost=_costs(padded)[windows.rows.first])
         estimate, variance, raw, score = maps
         return self._best_of(ImprovementMap(estimate, variance, known, raw), score, sum(histograms))
 
@@ -150,6 +154,16 @@ class ImprovementSelector:
         wanted = int(self.share * np.count_nonzero(found.known))
         mask = found.raw >= best_threshold(found.raw.ravel(), levels, wanted)
         return ImprovementSelection(mask, score, self.name, *found)
+
+
+def _costs(padded: Floats) -> Floats:
+    """How long each lattice row takes, in windows without holes; those with some are solved one by one."""
+    rows, columns = (size - 2 for size in padded.shape)
+    known = (padded > 0).view(np.uint8)
+    beside = known[:, :columns] + known[:, 1:-1] + known[:, 2:]
+    held = beside[:rows] + beside[1:-1] + beside[2:]
+    holed: Floats = np.count_nonzero((held > 1) & (held < SEEDS), axis=1).astype(np.float32)
+    return columns + HOLED * holed
 
 
 def _half(depth_mm: Floats) -> np.float32:
