@@ -32,17 +32,6 @@ def _record(uv: Ints, depth_mm: Floats, image_mm: Floats, bits: npt.NDArray[np.u
         image_mm[v, u] = depth_mm[i] if depth_mm[i] > 0 else MISSED
 
 
-@njit(cache=True, nogil=True)
-def _all_new(uv: Ints, image_mm: Floats) -> bool:
-    new = 0
-    while new < len(uv) and image_mm[uv[new, 1], uv[new, 0]] == 0:
-        image_mm[uv[new, 1], uv[new, 0]] = MISSED  # for a moment, to meet those that come twice
-        new += 1
-    for i in range(new):
-        image_mm[uv[i, 1], uv[i, 0]] = 0
-    return new == len(uv)
-
-
 def seed_pitch_px(seeds: SeedGrid) -> float:
     """Widest step of a seed lattice in pixels."""
     return max(n / cells for n, cells in zip(seeds.frame_shape, seeds.shape, strict=True))
@@ -128,10 +117,6 @@ class Samples:
         self.nearest_mm = min(self.nearest_mm, float(mm[mm > 0].min(initial=np.inf)))
         self._added.append((pixels, mm))
         _record(pixels, mm, self.image_mm, self.bits)
-
-    def all_new(self, pixels: Ints) -> bool:
-        """Whether none of some pixels of the frame was measured yet, nor is in there twice."""
-        return bool(_all_new(pixels, self.image_mm))
 
     def added_since(self, addition: int) -> Iterator[tuple[Ints, Floats]]:
         """Pixels and depths (0 = no return) of every addition after one of that number."""

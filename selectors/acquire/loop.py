@@ -210,7 +210,10 @@ def acquire(
 def _allowed(uv: npt.ArrayLike, samples: Samples, left: int) -> Ints:
     """What a plan asks for, if it may: pixels of the frame, each for the first time, no more."""
     pixels = pixels_in(uv, samples.frame_shape, "the plan's pixels")
-    if len(pixels) > left or not samples.all_new(pixels):
+    image_mm, asked = samples.image_mm, np.zeros(samples.frame_shape, np.bool_)
+    asked[pixels[:, 1], pixels[:, 0]] = True
+    twice = np.count_nonzero(asked) < len(pixels)
+    if len(pixels) > left or twice or image_mm[pixels[:, 1], pixels[:, 0]].any():
         raise ValueError(
             f"the selector's plan asks for {len(pixels)} pixels where {left} are left, or for a pixel twice, or for"
             " some that are measured already"

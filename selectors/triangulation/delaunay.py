@@ -60,15 +60,6 @@ def _insert_all(
 
 
 @njit(cache=True, nogil=True)
-def _fill_bins(uv: Ints, tri: Ints, count: int, bins: Ints, shift: int) -> None:
-    """Remember a triangle in every bin that holds a corner."""
-    for t in range(count):
-        p = tri[t, 0]
-        if p != GHOST:
-            bins[uv[p, 1] >> shift, uv[p, 0] >> shift] = t
-
-
-@njit(cache=True, nogil=True)
 def _brio_keys(uv: Ints, keys: Longs) -> None:
     """Sort keys of an order that inserts fast: rounds of doubling size, each in snake tiles."""
     for i in range(len(uv)):
@@ -141,19 +132,21 @@ class Mesh:
         starts = row_starts(points[:n])
         if starts is not None:
             count = zip_rows(points[:n], starts, tri, adj)
-            _fill_bins(points, tri, count, bins, shift)
-            return cls(points, tri, adj, bins, shift, changed, n, count)
-        keys = np.empty(n, np.int64)
-        _brio_keys(points[:n], keys)
-        order = np.argsort(keys)
-        ordered = points[order]
-        third = _first_triangle(ordered, n, tri, adj)
-        if third < 0:
-            return None
-        count = _insert_all(ordered, 2, n, third, tri, adj, 4, bins, shift, changed)
-        # Back to the caller's numbering of the points.
-        names = np.append(order, GHOST).astype(np.int32)
-        tri[:count] = names[tri[:count]]
+            some = np.arange(0, count, 3)
+            at = points[tri[some, 0]] >> shift  # the ghost's is some place as well
+            bins[at[:, 1], at[:, 0]] = some
+        else:
+            keys = np.empty(n, np.int64)
+            _brio_keys(points[:n], keys)
+            order = np.argsort(keys)
+            ordered = points[order]
+            third = _first_triangle(ordered, n, tri, adj)
+            if third < 0:
+                return None
+            count = _insert_all(ordered, 2, n, third, tri, adj, 4, bins, shift, changed)
+            # Back to the caller's numbering of the points.
+            names = np.append(order, GHOST).astype(np.int32)
+            tri[:count] = names[tri[:count]]
         return cls(points, tri, adj, bins, shift, changed, n, count)
 
     def add(self, uv: npt.NDArray[np.integer]) -> None:

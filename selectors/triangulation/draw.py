@@ -63,13 +63,6 @@ class Layers(NamedTuple):
     touched: Bools
 
 
-class Points(NamedTuple):
-    """The samples as the triangulation has them: pixels (n, 2), column first, and depths (n,) in mm."""
-
-    uv: Ints
-    z_mm: Floats
-
-
 @njit(cache=True, nogil=True, inline="always")
 def touch(touched: Bools, top: Whole, left: Whole, bottom: Whole, right: Whole) -> None:
     """Book a change of pixels in these rows and columns, which their neighbours may heed."""
@@ -120,41 +113,36 @@ def sort_out(changed: Bools, uv: Ints, z_mm: Floats, tri: Ints, kind: Bytes, dra
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_edge(layers: Layers, points: Points, a: int, b: int, plainly: bool, spread: np.float32) -> None:
+def _draw_edge(layers: Layers, uv: Ints, z_mm: Floats, a: int, b: int, plainly: bool, spread: np.float32) -> None:
     """Draw the pixels between two points: to the last bit the same from either side.
 
     `spread` is theirs too if it is not negative.
     """
-    if _after(points.uv, a, b):
+    if _after(uv, a, b):
         a, b = b, a
-    u, v = points.uv[a, 0], points.uv[a, 1]
-    du, dv = points.uv[b, 0] - u, points.uv[b, 1] - v
+    u, v = uv[a, 0], uv[a, 1]
+    du, dv = uv[b, 0] - u, uv[b, 1] - v
     steps, rest = abs(du), abs(dv)
     while rest:
         steps, rest = rest, steps % rest
     width = layers.depth_mm.shape[1]
-    z, rise = points.z_mm[a], points.z_mm[b] - points.z_mm[a]
     for step in range(1, steps):
         x, y = u + du // steps * step, v + dv // steps * step
         near = layers.nearest[y, x]
+        linear = z_mm[a] + (z_mm[b] - z_mm[a]) * np.float64(step) / np.float64(steps)
         layers.plain[y, x] = plainly
-        layers.depth_mm[y, x] = (
-            z + rise * np.float64(step) / np.float64(steps)
-            if plainly
-            else layers.samples_mm[near // width, near % width]
-        )
+        layers.depth_mm[y, x] = linear if plainly else layers.samples_mm[near // width, near % width]
         if spread >= 0:
             layers.spread_mm2[y, x] = spread
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def _fill(layers: Layers, points: Points, a: int, b: int, c: int, bridge: bool) -> np.float32:
+def _fill(layers: Layers, uv: Ints, z_mm: Floats, a: int, b: int, c: int, bridge: bool) -> np.float32:
     """Draw a triangle's inside, its right edges, and its upper one if that is level.
 
     So each pixel of an edge is drawn by one of its two triangles. The variance of the corners'
     depths is returned.
     """
-    uv, z_mm = points.uv, points.z_mm
     if _after(uv, a, b):
         a, b = b, a
     if _after(uv, b, c):
@@ -191,13 +179,14 @@ def _fill(layers: Layers, points: Points, a: int, b: int, c: int, bridge: bool) 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def draw(first: int, end: int, drawn: Ints, layers: Layers, points: Points, tri: Ints, adj: Ints, kind: Bytes) -> None:
+def draw(
+    first: int, end: int, drawn: Ints, layers: Layers, uv: Ints, z_mm: Floats, tri: Ints, adj: Ints, kind: Bytes
+) -> None:
     """Draw triangles into the model: those that bridge nothing linearly, the others not at all.
 
     Pixels on the edge that a bridge shares with a plain triangle are the plain one's, and a sample
     counts as plain. So whichever triangle is drawn last, the model is the same.
     """
-    uv, z_mm = points.uv, points.z_mm
     for t in drawn[first:end]:
         a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
         bridge = kind[t] == _BRIDGE
@@ -205,7 +194,7 @@ def draw(first: int, end: int, drawn: Ints, layers: Layers, points: Points, tri:
             layers.touched, min(uv[a, 1], uv[b, 1], uv[c, 1]), min(uv[a, 0], uv[b, 0], uv[c, 0]),
             max(uv[a, 1], uv[b, 1], uv[c, 1]), max(uv[a, 0], uv[b, 0], uv[c, 0]),
         )  # fmt: skip
-        spread = _fill(layers, points, a, b, c, bridge)
+        spread = _fill(layers, uv, z_mm, a, b, c, bridge)
         for k in range(3):
             other = kind[adj[t, k]]
             if other == _PLAIN and not bridge:
@@ -214,9 +203,9 @@ def draw(first: int, end: int, drawn: Ints, layers: Layers, points: Points, tri:
             du, dv = uv[stop, 0] - uv[begin, 0], uv[stop, 1] - uv[begin, 1]
             filled = dv > 0 or (dv == 0 and du > 0)
             if other == _OUTSIDE and not filled:
-                _draw_edge(layers, points, begin, stop, not bridge, spread)
+                _draw_edge(layers, uv, z_mm, begin, stop, not bridge, spread)
             elif (other == _PLAIN and filled) or (other == _BRIDGE and not filled):
-                _draw_edge(layers, points, begin, stop, not bridge or other == _PLAIN, np.float32(-1))
+                _draw_edge(layers, uv, z_mm, begin, stop, not bridge or other == _PLAIN, np.float32(-1))
         for p in (a, b, c):
             u, v = uv[p, 0], uv[p, 1]
             layers.plain[v, u] = True

@@ -78,9 +78,7 @@ def _nearest_along_rows(first: int, end: int, nearest_row: Ints, nearest: Ints, 
             top -= 1
 
 
-def nearest_sample(
-    valid: Bools, threads: int | None = None, into: tuple[Ints, Ints] | None = None
-) -> tuple[Ints, Ints]:
+def nearest_sample(valid: Bools, threads: int | None = None) -> tuple[Ints, Ints]:
     """Nearest sample of every pixel, exactly, in time linear in the pixels.
 
     Parameters
@@ -89,8 +87,6 @@ def nearest_sample(
         Where there is a sample.
     threads : int, optional
         Kernel threads; default `default_threads()`.
-    into : tuple of int32 arrays of shape (H, W), optional
-        What to write the answer to; new arrays by default.
 
     Returns
     -------
@@ -107,7 +103,7 @@ def nearest_sample(
     """
     height, width = valid.shape
     nearest_row = np.empty((height, width), np.int32)
-    nearest, gap_sq = into or (np.empty((height, width), np.int32), np.empty((height, width), np.int32))
+    nearest, gap_sq = np.empty((height, width), np.int32), np.empty((height, width), np.int32)
     in_bands(_nearest_row_in_column, width, threads, valid, nearest_row)
     in_bands(_nearest_along_rows, height, threads, nearest_row, nearest, gap_sq)
     return nearest, gap_sq

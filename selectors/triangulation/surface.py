@@ -14,11 +14,10 @@ from functools import partial
 import numpy as np
 
 from selective_depth.drivers.kernels import njit
-from selective_depth.selectors.arrays import Bools, Floats, Ints
+from selective_depth.selectors.arrays import Floats, Ints
 from selective_depth.selectors.parallel import at_once, in_bands
 from selective_depth.selectors.triangulation.delaunay import Mesh
-from selective_depth.selectors.triangulation.draw import TILE_PX, Layers, Points, draw, sort_out, touch
-from selective_depth.selectors.triangulation.flips import GHOST
+from selective_depth.selectors.triangulation.draw import TILE_PX, Layers, draw, sort_out, touch
 from selective_depth.selectors.triangulation.nearest import FAR_SQ, nearest_sample
 
 MANY = 1000
@@ -95,28 +94,6 @@ def _claim(layers: Layers, uv: Ints) -> None:
                 v += direction
 
 
-@njit(cache=True, nogil=True)
-def _mark_stars(tri: Ints, other: Bools, changed: Bools) -> None:
-    """Mark the triangles of points whose depth is another now."""
-    for t in range(len(tri)):
-        for k in range(3):
-            changed[t] |= tri[t, k] != GHOST and other[tri[t, k]]
-
-
-@njit(cache=True, nogil=True)
-def _renew_far(layers: Layers) -> None:
-    """Give pixels that no plain triangle holds the depth of their nearest sample again."""
-    height, width = layers.depth_mm.shape
-    for v in range(height):
-        for u in range(width):
-            if not layers.plain[v, u]:
-                near = layers.nearest[v, u]
-                z = layers.samples_mm[near // width, near % width]
-                if z != layers.depth_mm[v, u]:
-                    layers.depth_mm[v, u] = z
-                    touch(layers.touched, v, u, v, u)
-
-
 class Surface:
     """A dense model that samples can be added to.
 
@@ -173,14 +150,16 @@ class Surface:
         if differ.any():
             self._depth_mm[point[again]] = self.layers.samples_mm[v, u] = depth_mm[again]
             if self._mesh is not None:
-                other = np.zeros(len(self._uv), np.bool_)
+                other = np.zeros(len(self._uv) + 1, np.bool_)  # and one for the ghost, which is -1
                 other[point[again][differ]] = True
-                end = self._mesh.triangles
-                _mark_stars(self._mesh.tri[:end], other, self._mesh.changed[:end])
+                a, b, c = self._mesh.tri[: self._mesh.triangles].T
+                self._mesh.changed[: self._mesh.triangles] |= other[a] | other[b] | other[c]
         self._insert(uv[point < 0], depth_mm[point < 0])
         self._draw_changed()
         if differ.any():
-            _renew_far(self.layers)
+            layers, far = self.layers, ~self.layers.plain
+            layers.depth_mm[far] = layers.samples_mm.ravel()[layers.nearest[far]]
+            layers.touched[:] = True
 
     def _insert(self, uv: Ints, depth_mm: Floats) -> None:
         """Take in samples without drawing them."""
@@ -203,7 +182,7 @@ class Surface:
         if len(uv) < len(self._uv):
             _claim(layers, uv)
         else:  # one by one, the first of many samples would claim whole images
-            nearest_sample(layers.samples_mm > 0, 1, into=(layers.nearest, layers.gap_sq))
+            layers.nearest[:], layers.gap_sq[:] = nearest_sample(layers.samples_mm > 0, 1)
             np.take(layers.samples_mm, layers.nearest, out=layers.depth_mm, mode="clip")
             layers.touched[:] = True
 
@@ -222,6 +201,6 @@ class Surface:
         if len(self._kind) < len(mesh.tri):  # it has grown
             self._kind = np.pad(self._kind, (0, len(mesh.tri) - len(self._kind)))
         drawn = np.empty(mesh.triangles, np.int32)
-        points = Points(mesh.uv, self._depth_mm)
+        points = mesh.uv, self._depth_mm
         count = sort_out(mesh.changed[: mesh.triangles], *points, mesh.tri, self._kind, drawn)
-        in_bands(draw, count, self._threads_for(count), drawn, layers, points, mesh.tri, mesh.adj, self._kind)
+        in_bands(draw, count, self._threads_for(count), drawn, layers, *points, mesh.tri, mesh.adj, self._kind)
