@@ -54,7 +54,7 @@ def in_bands(
     """
     count = max(min(threads or default_threads(), rows), 1)
     shares = np.arange(1, count) / count
-    inner = shares * rows if cost is None else np.searchsorted(np.cumsum(cost), shares * cost.sum())
+    inner = shares * rows if cost is None else np.searchsorted(np.cumsum(cost) - cost / 2, shares * cost.sum())
     edges = 0, *inner.astype(int).tolist(), rows
     at_once(*(partial(kernel, *band, *arguments) for band in pairwise(edges)), threads=count)
 

@@ -81,7 +81,7 @@ def _after(uv: Ints, a: int, b: int) -> bool:
     return bool((uv[a, 1] << 16) + uv[a, 0] > (uv[b, 1] << 16) + uv[b, 0])  # with `or`, twice as slow
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _bridges(uv: Ints, z_mm: Floats, a: int, b: int, c: int) -> bool:
     """Whether a triangle of three points spans a hole or a depth step."""
     if max(z_mm[a], z_mm[b], z_mm[c]) - min(z_mm[a], z_mm[b], z_mm[c]) <= STEP_MM:
