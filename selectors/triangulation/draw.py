@@ -63,6 +63,10 @@ class Layers(NamedTuple):
     touched: Bools
 
 
+Points = tuple[Ints, Floats]
+Triangles = tuple[Ints, Ints, Bytes]
+
+
 @njit(cache=True, nogil=True, inline="always")
 def touch(touched: Bools, top: Whole, left: Whole, bottom: Whole, right: Whole) -> None:
     """Book a change of pixels in these rows and columns, which their neighbours may heed."""
@@ -113,7 +117,9 @@ def sort_out(changed: Bools, uv: Ints, z_mm: Floats, tri: Ints, kind: Bytes, dra
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_edge(layers: Layers, uv: Ints, z_mm: Floats, a: int, b: int, plainly: bool, spread: np.float32) -> None:
+def _draw_edge(
+    flat: Layers, width: int, uv: Ints, z_mm: Floats, a: int, b: int, plainly: bool, spread: np.float32
+) -> None:
     """Draw the pixels between two points: to the last bit the same from either side.
 
     `spread` is theirs too if it is not negative.
@@ -125,19 +131,17 @@ def _draw_edge(layers: Layers, uv: Ints, z_mm: Floats, a: int, b: int, plainly: 
     steps, rest = abs(du), abs(dv)
     while rest:
         steps, rest = rest, steps % rest
-    width = layers.depth_mm.shape[1]
     for step in range(1, steps):
-        x, y = u + du // steps * step, v + dv // steps * step
-        near = layers.nearest[y, x]
+        p = (v + dv // steps * step) * width + u + du // steps * step
         linear = z_mm[a] + (z_mm[b] - z_mm[a]) * np.float64(step) / np.float64(steps)
-        layers.plain[y, x] = plainly
-        layers.depth_mm[y, x] = linear if plainly else layers.samples_mm[near // width, near % width]
+        flat.plain[p] = plainly
+        flat.depth_mm[p] = linear if plainly else flat.samples_mm[flat.nearest[p]]
         if spread >= 0:
-            layers.spread_mm2[y, x] = spread
+            flat.spread_mm2[p] = spread
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def _fill(layers: Layers, uv: Ints, z_mm: Floats, a: int, b: int, c: int, bridge: bool) -> np.float32:
+def _fill(flat: Layers, width: int, uv: Ints, z_mm: Floats, a: int, b: int, c: int, bridge: bool) -> np.float32:
     """Draw a triangle's inside, its right edges, and its upper one if that is level.
 
     So each pixel of an edge is drawn by one of its two triangles. The variance of the corners'
@@ -159,42 +163,41 @@ def _fill(layers: Layers, uv: Ints, z_mm: Floats, a: int, b: int, c: int, bridge
     spread = ((z_mm[a] - mean) ** 2 + (z_mm[b] - mean) ** 2 + (z_mm[c] - mean) ** 2) / np.float32(3)
     # Crossings are whole or at least 1 / height from it: a little more, and none is cut off.
     ac, ab, bc = (u2 - u0) / (v2 - v0), (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1)
-    width = layers.depth_mm.shape[1]
+    samples_mm, nearest, _, depth_mm, plain, spread_mm2, _ = flat
     for v in range(v0, v2):
         long = int(u0 + (v - v0) * ac + _SURE)
         short = int(u0 + (v - v0) * ab + _SURE) if v < v1 else int(u1 + (v - v1) * bc + _SURE)
         first, end = (short, long) if area < 0 else (long, short)
-        depth, plain, spreads = layers.depth_mm[v], layers.plain[v], layers.spread_mm2[v]
         z = z0 + (v - v0) * down + (first + 1 - u0) * along
-        for u in range(np.uint64(first + 1), np.uint64(end + 1)):  # unsigned: none is counted from the end
-            spreads[u] = spread
-            plain[u] = not bridge
-            depth[u] = z
+        # Unsigned, so that none is counted from the end.
+        for p in range(np.uint64(v * width + first + 1), np.uint64(v * width + end + 1)):
+            spread_mm2[p] = spread
+            plain[p] = not bridge
+            depth_mm[p] = samples_mm[nearest[p]] if bridge else z
             z += along
-        if bridge:
-            for u in range(first + 1, end + 1):
-                near = layers.nearest[v, u]
-                depth[u] = layers.samples_mm[near // width, near % width]
     return np.float32(spread)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def draw(
-    first: int, end: int, drawn: Ints, layers: Layers, uv: Ints, z_mm: Floats, tri: Ints, adj: Ints, kind: Bytes
-) -> None:
+def draw(first: int, end: int, drawn: Ints, flat: Layers, width: int, points: Points, mesh: Triangles) -> None:
     """Draw triangles into the model: those that bridge nothing linearly, the others not at all.
+
+    `flat` are the layers, each but `touched` as one row of pixels; `points` their pixels and depths;
+    `mesh` its triangles, their neighbours and kinds.
 
     Pixels on the edge that a bridge shares with a plain triangle are the plain one's, and a sample
     counts as plain. So whichever triangle is drawn last, the model is the same.
     """
+    uv, z_mm = points
+    tri, adj, kind = mesh
     for t in drawn[first:end]:
         a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
         bridge = kind[t] == _BRIDGE
         touch(
-            layers.touched, min(uv[a, 1], uv[b, 1], uv[c, 1]), min(uv[a, 0], uv[b, 0], uv[c, 0]),
+            flat.touched, min(uv[a, 1], uv[b, 1], uv[c, 1]), min(uv[a, 0], uv[b, 0], uv[c, 0]),
             max(uv[a, 1], uv[b, 1], uv[c, 1]), max(uv[a, 0], uv[b, 0], uv[c, 0]),
         )  # fmt: skip
-        spread = _fill(layers, uv, z_mm, a, b, c, bridge)
+        spread = _fill(flat, width, uv, z_mm, a, b, c, bridge)
         for k in range(3):
             other = kind[adj[t, k]]
             if other == _PLAIN and not bridge:
@@ -203,11 +206,9 @@ def draw(
             du, dv = uv[stop, 0] - uv[begin, 0], uv[stop, 1] - uv[begin, 1]
             filled = dv > 0 or (dv == 0 and du > 0)
             if other == _OUTSIDE and not filled:
-                _draw_edge(layers, uv, z_mm, begin, stop, not bridge, spread)
+                _draw_edge(flat, width, uv, z_mm, begin, stop, not bridge, spread)
             elif (other == _PLAIN and filled) or (other == _BRIDGE and not filled):
-                _draw_edge(layers, uv, z_mm, begin, stop, not bridge or other == _PLAIN, np.float32(-1))
+                _draw_edge(flat, width, uv, z_mm, begin, stop, not bridge or other == _PLAIN, np.float32(-1))
         for p in (a, b, c):
-            u, v = uv[p, 0], uv[p, 1]
-            layers.plain[v, u] = True
-            layers.depth_mm[v, u] = z_mm[p]
-            layers.spread_mm2[v, u] = 0
+            at = uv[p, 1] * width + uv[p, 0]
+            flat.plain[at], flat.depth_mm[at], flat.spread_mm2[at] = True, z_mm[p], 0

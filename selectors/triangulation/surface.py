@@ -61,25 +61,26 @@ def _claim(layers: Layers, uv: Ints) -> None:
     They form a convex region about the sample: in each row one run, which touches that of the row
     before.
     """
-    gap_sq, nearest = layers.gap_sq, layers.nearest
+    samples_mm, nearest, gap_sq, depth_mm, plain, _, touched = layers
     height, width = gap_sq.shape
     for i in range(len(uv)):
         u0, v0 = uv[i, 0], uv[i, 1]
         name = v0 * width + u0
-        z = layers.samples_mm[v0, u0]
+        z = samples_mm[v0, u0]
         for direction in (-1, 1):
             left, right, passed = u0, u0, 0
             v = v0 if direction < 0 else v0 + 1
             while 0 <= v < height:
-                first, last = width, -1
-                for u in range(max(left - 1, 0), min(right + 2, width)):
-                    if _nearer(gap_sq, nearest, v, u, v0, u0):
-                        first, last = min(first, u), u
-                if last < 0:
+                first, last = max(left - 1, 0), min(right + 1, width - 1)
+                while first <= last and not _nearer(gap_sq, nearest, v, first, v0, u0):
+                    first += 1
+                if first > last:
                     if passed == abs(v - v0) // _THIN_PX:
                         break
                     passed, left, right, v = passed + 1, left - 1, right + 1, v + direction
                     continue
+                while not _nearer(gap_sq, nearest, v, last, v0, u0):
+                    last -= 1
                 while first > 0 and _nearer(gap_sq, nearest, v, first - 1, v0, u0):
                     first -= 1
                 while last < width - 1 and _nearer(gap_sq, nearest, v, last + 1, v0, u0):
@@ -87,9 +88,9 @@ def _claim(layers: Layers, uv: Ints) -> None:
                 for u in range(first, last + 1):
                     gap_sq[v, u] = (u - u0) * (u - u0) + (v - v0) * (v - v0)
                     nearest[v, u] = name
-                    if not layers.plain[v, u]:
-                        layers.depth_mm[v, u] = z
-                touch(layers.touched, v, first, v, last)
+                    if not plain[v, u]:
+                        depth_mm[v, u] = z
+                touch(touched, v, first, v, last)
                 left, right = first, last
                 v += direction
 
@@ -203,4 +204,6 @@ class Surface:
         drawn = np.empty(mesh.triangles, np.int32)
         points = mesh.uv, self._depth_mm
         count = sort_out(mesh.changed[: mesh.triangles], *points, mesh.tri, self._kind, drawn)
-        in_bands(draw, count, self._threads_for(count), drawn, layers, *points, mesh.tri, mesh.adj, self._kind)
+        flat, width = Layers(*(layer.ravel() for layer in layers[:-1]), layers.touched), layers.depth_mm.shape[1]
+        triangles = mesh.tri, mesh.adj, self._kind
+        in_bands(draw, count, self._threads_for(count), drawn, flat, width, points, triangles)
