@@ -40,10 +40,10 @@ def _gather(score: Floats, least: float, crowded: float, pixel: Longs, worth: Fl
                 s = score[v, u]
                 if s <= 0 or s < limit:
                     continue
-                better = False
-                for y in range(max(v - 1, 0), min(v + 2, height)):
-                    for x in range(max(u - 1, 0), min(u + 2, width)):
-                        better |= score[y, x] > s
+                left_of, right_of = max(u - 1, 0), min(u + 1, width - 1)
+                better = (score[v, left_of] > s) | (score[v, right_of] > s)
+                for y in (max(v - 1, 0), min(v + 1, height - 1)):
+                    better |= (score[y, left_of] > s) | (score[y, u] > s) | (score[y, right_of] > s)
                 if better:
                     s *= np.float32(crowded)
                     if s < limit:
