@@ -94,23 +94,16 @@ def locate(uv: Ints, tri: Ints, adj: Ints, p: int, t: int) -> int:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _relink(adj: Ints, t: int, old: int, new: int) -> None:
-    """Tell triangle t that its neighbour `old` is now `new`."""
-    if adj[t, 0] == old:
-        adj[t, 0] = new
-    elif adj[t, 1] == old:
-        adj[t, 1] = new
-    else:
-        adj[t, 2] = new
+def _side(adj: Ints, t: int, o: int) -> int:
+    """Which corner of t lies across from its neighbour o; without a branch, which would be a guess."""
+    return int((adj[t, 1] == o) + 2 * (adj[t, 2] == o))
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _flip(tri: Ints, adj: Ints, t: int, o: int) -> None:
     """Turn the edge bc between t = (p, b, c) and o = (d, c, b) into pd; p is corner 0 of both."""
     b, c = tri[t, 1], tri[t, 2]
-    j = 0
-    while tri[o, j] == b or tri[o, j] == c:
-        j += 1
+    j = _side(adj, o, t)
     d = tri[o, j]
     n_bd, n_dc = adj[o, NEXT[j]], adj[o, NEXT[j + 1]]
     n_cp = adj[t, 1]
@@ -118,8 +111,8 @@ def _flip(tri: Ints, adj: Ints, t: int, o: int) -> None:
     tri[o, 0], tri[o, 1], tri[o, 2] = tri[t, 0], d, c
     adj[t, 0], adj[t, 1] = n_bd, o
     adj[o, 0], adj[o, 1], adj[o, 2] = n_dc, n_cp, t
-    _relink(adj, n_bd, o, t)
-    _relink(adj, n_cp, t, o)
+    adj[n_bd, _side(adj, n_bd, o)] = t
+    adj[n_cp, _side(adj, n_cp, t)] = o
 
 
 @njit(cache=True, nogil=True)
@@ -135,8 +128,8 @@ def insert(uv: Ints, tri: Ints, adj: Ints, count: int, p: int, t: int, stack: In
     adj[t, 0], adj[t, 1], adj[t, 2] = na, t1, t2
     adj[t1, 0], adj[t1, 1], adj[t1, 2] = nb, t2, t
     adj[t2, 0], adj[t2, 1], adj[t2, 2] = nc, t, t1
-    _relink(adj, nb, t, t1)
-    _relink(adj, nc, t, t2)
+    adj[nb, _side(adj, nb, t)] = t1
+    adj[nc, _side(adj, nc, t)] = t2
     stack[0], stack[1], stack[2] = t, t1, t2
     changed[t] = changed[t1] = changed[t2] = True
     top = 3
