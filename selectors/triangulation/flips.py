@@ -102,7 +102,7 @@ def _side(adj: Ints, t: int, o: int) -> int:
 @njit(cache=True, nogil=True, inline="always")
 def _flip(tri: Ints, adj: Ints, t: int, o: int) -> None:
     """Turn the edge bc between t = (p, b, c) and o = (d, c, b) into pd; p is corner 0 of both."""
-    b, c = tri[t, 1], tri[t, 2]
+    c = tri[t, 2]
     j = _side(adj, o, t)
     d = tri[o, j]
     n_bd, n_dc = adj[o, NEXT[j]], adj[o, NEXT[j + 1]]
