@@ -162,8 +162,8 @@ def _costs(padded: Floats) -> Floats:
     known = (padded > 0).view(np.uint8)
     beside = known[:, :columns] + known[:, 1:-1] + known[:, 2:]
     held = beside[:rows] + beside[1:-1] + beside[2:]
-    holed: Floats = np.count_nonzero((held > 1) & (held < SEEDS), axis=1).astype(np.float32)
-    return columns + HOLED * holed
+    costs: Floats = columns + np.float32(HOLED) * np.count_nonzero((held > 1) & (held < SEEDS), axis=1)
+    return costs
 
 
 def _half(depth_mm: Floats) -> np.float32:
