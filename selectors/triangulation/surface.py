@@ -10,7 +10,6 @@ were; but for a pixel, once in many frames, whose nearest samples are a dozen pi
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -205,7 +204,7 @@ class Surface:
         drawn = np.empty(mesh.triangles, np.int32)
         points = mesh.uv, self._depth_mm
         count = sort_out(mesh.changed[: mesh.triangles], *points, mesh.tri, self._kind, drawn)
-        rows: Any = [layer.ravel() for layer in layers[:-1]]
-        flat, width = Layers(*rows, layers.touched), layers.depth_mm.shape[1]
+        flat = Layers._make((*(layer.ravel() for layer in layers[:-1]), layers.touched))
+        width = layers.depth_mm.shape[1]
         triangles = mesh.tri, mesh.adj, self._kind
         in_bands(draw, count, self._threads_for(count), drawn, flat, width, points, triangles)
