@@ -1,7 +1,8 @@
 """Delaunay triangulation of pixels that grows point by point, exactly.
 
-Adding the shots of a round to the triangulation of the samples so far costs about a microsecond
-each, where a triangulation from scratch would cost the whole frame again.
+Adding the shots of a round to the triangulation of the samples so far costs a fifth of a
+microsecond each, where a triangulation from scratch would cost the whole frame again. Of points on
+one circle a hash decides, so that the triangulation is the same whatever their order.
 
 Insertion follows Lawson (1977): split the triangle that holds the new point, then flip edges
 until every circumcircle is empty. The outside of the convex hull is covered by *ghost* triangles
