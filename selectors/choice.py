@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
-from selective_depth.selectors.arrays import Floats, Ints, Longs, checked_map
-from selective_depth.selectors.parallel import in_bands
+from selective_depth.selectors.arrays import Floats, Ints, checked_map
 
 CROWDED = 0.3
 """Factor on the worth of a pixel beside a better one, whose shot will mostly tell the same.
@@ -23,12 +22,12 @@ _SAMPLED = 31  # shares no factor with the usual widths of images
 
 
 @njit(cache=True, nogil=True)
-def _gather(score: Floats, least: float, crowded: float, pixel: Longs, worth: Floats, first: int, end: int) -> int:
-    """Pixels of the rows first..end worth at least `least`, written from first's place on."""
+def _gather(score: Floats, least: float, crowded: float, uv: Ints, worth: Floats) -> int:
+    """List the pixels worth at least `least`, row by row; how many is returned."""
     height, width = score.shape
     limit = np.float32(least)
-    at = first * width
-    for v in range(first, end):
+    count = 0
+    for v in range(height):
         for left in range(0, width, _BLOCK):
             block = score[v, left : left + _BLOCK]
             some = np.int32(0)
@@ -48,39 +47,28 @@ def _gather(score: Floats, least: float, crowded: float, pixel: Longs, worth: Fl
                     s *= np.float32(crowded)
                     if s < limit:
                         continue
-                pixel[at], worth[at] = v * width + u, s
-                at += 1
-    count: int = at - first * width
+                uv[count, 0], uv[count, 1], worth[count] = u, v, s
+                count += 1
     return count
 
 
-def _best(score: Floats, shots: int, least: float, crowded: float, threads: int | None) -> Ints:
+def _best(score: Floats, shots: int, least: float, crowded: float) -> Ints:
     """The pixels worth most, and `least` at the least, row by row of the image."""
-    width = score.shape[1]
-    pixel, worth = np.empty(score.size, np.int64), np.empty(score.size, np.float32)
-    parts: list[tuple[int, int]] = []
-
-    def band(first: int, end: int) -> None:
-        count = _gather(score, least, crowded, pixel, worth, first, end)
-        parts.append((first * width, count))
-
-    if shots > 0:
-        in_bands(band, len(score), threads)
-    runs = [slice(start, start + count) for start, count in sorted(parts)]
-    pixel = np.concatenate([pixel[:0], *(pixel[run] for run in runs)])
-    worth = np.concatenate([worth[:0], *(worth[run] for run in runs)])
-    if len(pixel) > shots:
-        last = np.partition(worth, len(worth) - shots)[-shots]
+    uv, worth = np.empty((score.size, 2), np.int32), np.empty(score.size, np.float32)
+    count = _gather(score, least, crowded, uv, worth) if shots > 0 else 0
+    uv, worth = uv[:count].copy(), worth[:count]
+    if count > shots:
+        last = np.partition(worth, count - shots)[-shots]
         sure = worth > last
         ties = np.flatnonzero(worth == last)
         # Of equals, take some from everywhere rather than the topmost.
-        scatter = (pixel[ties] * 2654435761) & 0xFFFFFFFF
+        scatter = (uv[ties] @ np.array((1, score.shape[1])) * 2654435761) & 0xFFFFFFFF
         sure[ties[np.argsort(scatter)[: shots - np.count_nonzero(sure)]]] = True
-        pixel = pixel[sure]
-    return np.stack((pixel % width, pixel // width), axis=-1).astype(np.int32)
+        uv = uv[sure]
+    return uv
 
 
-def choose(score: npt.ArrayLike, shots: int, *, crowded: float = CROWDED, threads: int | None = None) -> Ints:
+def choose(score: npt.ArrayLike, shots: int, *, crowded: float = CROWDED) -> Ints:
     """The pixels of a map that are worth most.
 
     Parameters
@@ -91,8 +79,6 @@ def choose(score: npt.ArrayLike, shots: int, *, crowded: float = CROWDED, thread
         How many pixels at most.
     crowded : float, default `CROWDED`
         Factor on pixels with a better one among their eight neighbours.
-    threads : int, optional
-        Kernel threads; default `default_threads()`.
 
     Returns
     -------
@@ -114,17 +100,17 @@ def choose(score: npt.ArrayLike, shots: int, *, crowded: float = CROWDED, thread
         raise ValueError(f"score must have shape (height, width), got {np.shape(score)}")
     if shots < 0:
         raise ValueError(f"shots is {shots}; give 0 or more")
-    return best_pixels(checked_map(score, np.shape(score), "score"), shots, crowded=crowded, threads=threads)
+    return best_pixels(checked_map(score, np.shape(score), "score"), shots, crowded=crowded)
 
 
-def best_pixels(worth: Floats, shots: int, *, crowded: float = CROWDED, threads: int | None = None) -> Ints:
+def best_pixels(worth: Floats, shots: int, *, crowded: float = CROWDED) -> Ints:
     """As `choose`, of a map known to be float32, whole in memory and nowhere negative or NaN."""
     # Most pixels are out of the question: a sample of them says where to draw a safe line.
     some = worth.ravel()[::_SAMPLED]
     rank = 3 * shots // _SAMPLED
     while True:
         least = float(np.partition(some, len(some) - rank)[-rank]) if 0 < rank < len(some) else 0.0
-        uv = _best(worth, shots, least, crowded, threads)
+        uv = _best(worth, shots, least, crowded)
         if len(uv) == shots or least <= 0:
             return uv
         rank *= 2

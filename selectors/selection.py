@@ -144,16 +144,15 @@ class _Plainly:
 
     selector: Selector
     samples: Samples
-    threads: int | None
 
     def best(self, shots: int) -> Ints:
         selection = self.selector.select(self.samples)
         worth = checked_map(selection.worth, self.samples.frame_shape, "the worth of a selection")
         worth[~self.samples.open()] = 0
-        return choose(worth, shots, crowded=selection.crowded, threads=self.threads)
+        return choose(worth, shots, crowded=selection.crowded)
 
 
-def plan_of(selector: Selector | Worth, samples: Samples, threads: int | None = None) -> Plan:
+def plan_of(selector: Selector | Worth, samples: Samples) -> Plan:
     """Begin an acquisition by any selector.
 
     Parameters
@@ -163,8 +162,6 @@ def plan_of(selector: Selector | Worth, samples: Samples, threads: int | None = 
         (`choose`) that were not measured yet and are not deep in a hole (`Samples.open`).
     samples : Samples
         What was measured so far; what the plan leads to is to be added to it.
-    threads : int, optional
-        Kernel threads of choosing.
 
     Raises
     ------
@@ -175,9 +172,9 @@ def plan_of(selector: Selector | Worth, samples: Samples, threads: int | None = 
         if isinstance(selector, Planner):
             return selector.plan(samples)
         if isinstance(selector, Selector):
-            return _Plainly(selector, samples, threads)
+            return _Plainly(selector, samples)
         if callable(selector):
-            return _Plainly(FunctionSelector(selector), samples, threads)
+            return _Plainly(FunctionSelector(selector), samples)
     raise TypeError(
         f"selector is {selector!r}; give an object with select(samples), such as"
         " ImprovementSelector(), or a function from samples to a worth for every pixel"

@@ -54,7 +54,7 @@ class ColourPlan(SurfacePlan):
         self.look()
         rule = self._rule
         assert isinstance(rule, ColourSelector) and rule.hint is not None
-        return choose(self.score * rule.hint, shots, threads=rule.threads)
+        return choose(self.score * rule.hint, shots)
 
 
 def ratios(frames: Sequence[DepthFrame], budget: float, rounds: int, strength: float) -> list[float]:

@@ -179,7 +179,7 @@ def acquire(
     even_uv, pitch_px = finer_lattice(seeds, total if rounds > 1 else 0)
     samples = Samples.of(seeds, pitch_px)
     chosen_by = selector or best_selector(rounds, threads)
-    plan = plan_of(chosen_by, samples, threads)
+    plan = plan_of(chosen_by, samples)
     lattice_mm = seeds.depth_mm.ravel()
     uv, depth = [seeds.lattice_uv.reshape(-1, 2)], [lattice_mm]
     whole = _fits_16_bits(lattice_mm) and bool((lattice_mm == np.rint(lattice_mm)).all())

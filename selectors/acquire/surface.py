@@ -158,7 +158,7 @@ class SurfacePlan:
     def best(self, shots: int) -> Ints:
         """The `shots` pixels that are worth most, from the samples as they are now."""
         self.look()
-        return best_pixels(self.score, shots, threads=self._rule.threads)
+        return best_pixels(self.score, shots)
 
     def model_mm(self) -> Floats:
         """Dense depth of the samples as they are now, float32 (height, width); a copy."""

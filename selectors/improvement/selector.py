@@ -197,7 +197,7 @@ class ImprovementPlan:
             changed = maximum_filter(changed, sides)
             self._raw[changed] = rule._map(samples, changed).raw[changed]
             self._seen = samples.additions
-        return choose(np.where(samples.open(), self._raw, 0), shots, threads=rule.threads)
+        return choose(np.where(samples.open(), self._raw, 0), shots)
 
 
 _kept = threading.local()

@@ -297,7 +297,7 @@ class TemporalAcquisition:
         for left in range(EXTENT_ROUNDS, 0, -1):
             _, border_px = extent.changed()
             shots = (self._shots - sensor.spent) // (left + 1)
-            new = sensor.unasked(choose(border_px, shots, threads=self.threads))
+            new = sensor.unasked(choose(border_px, shots))
             extent.add(new, contradicts(new, sensor(new), model_mm))
         where, _ = extent.changed()
         changed[:] = maximum_filter(where, 2 * MARGIN_PX + 1)
@@ -339,9 +339,9 @@ class TemporalAcquisition:
             samples = Samples(self.shape, self._pitch_px)
             held = self._memory.held > 0
             samples.add(pixels_where(held), self._memory.fused_mm[held])
-            new = plan_of(self.selector, samples, self.threads).best(shots // 2)
+            new = plan_of(self.selector, samples).best(shots // 2)
             sensor(sensor.unasked(new))
             worth[self._memory.held == 0] = 0
             shots -= shots // 2
-        sensor(choose(worth, shots, threads=self.threads))
+        sensor(choose(worth, shots))
         self._book(sensor, first)
