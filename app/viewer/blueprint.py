@@ -108,7 +108,7 @@ class Shown:
 
     def _title(self, title: str) -> str:
         number, _, rest = title.partition(" ")
-        told = rest.replace("By", "Measured by") if self.visitor and number[0].isdigit() else title
+        told = rest if self.visitor and number[0].isdigit() else title
         return told.format(by=self.by.removesuffix(", with memory"))
 
     @property

@@ -26,6 +26,8 @@ CENTRE = np.float32(0.5)
 """Rerun puts pixel centres at halves, we at whole numbers."""
 USUAL_US = 33_333
 """From one frame to the next, where their times do not tell."""
+LINE_S = 0.5
+"""How long the line that tells the gain stays at least, to be read."""
 JPEG_QUALITY = 80
 CLOUD_STEP = 3
 """The coloured cloud has every third pixel each way: all of them would be 5 MB a frame."""
@@ -48,7 +50,7 @@ class StepLogger:
         self._shown: Shown | None = None
         self._timestamp_us, self._elapsed_s, self._logged_s = 0, 0.0, 0.0
         self._state = ""
-        self._line = ""
+        self._line, self._line_s = "", -LINE_S
         self._limits_mm = (0.0, 1.0)
 
     def log(self, step: FrameResult) -> None:
@@ -243,9 +245,10 @@ class StepLogger:
         hit = depth_mm > 0
         points_m = step.frame.camera.points_mm(uv[hit], depth_mm[hit]) * np.float32(0.001)
         log("world/samples", rr.Points3D(points_m, colors=colours[hit], radii=-1.5))
-        if step.gain and step.gain != self._line:
-            self._line = step.gain
-            log("line", _png(legend.headline(step.gain)))
+        if step.gain and step.gain != self._line and self._elapsed_s >= self._line_s + LINE_S:
+            self._line, self._line_s = step.gain, self._elapsed_s
+            # No PNG: the viewer in a browser takes those that follow each other for a film, and is long in decoding it.
+            log("line", rr.Image(legend.headline(step.gain)[:, :, 0]))
         if step.model is not None:
             self._log_models(step.frame, step.model, to_truth=step.memory is not None)
 

@@ -79,7 +79,7 @@ def test_without_a_budget_nothing_speaks_of_what_it_would_buy(visitor: bool) -> 
 def test_the_panel_of_what_was_acquired_names_its_selector(by: str) -> None:
     plain = by.removesuffix(", with memory")
     assert f"4 By {plain}" in titles_of(Shown(by=by))
-    assert f"Measured by {plain}" in titles_of(Shown(by=by, visitor=True))
+    assert f"By {plain}" in titles_of(Shown(by=by, visitor=True))
     assert f"**4 By {plain}**" in Shown(by=by).guide
 
 
@@ -185,15 +185,17 @@ def test_time_goes_on_where_a_clock_stands_or_goes_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(seconds, [0, 0.1, 0.133333, 0.166666, 0.216666], atol=1e-5)
 
 
-def test_the_line_is_logged_when_it_changes_and_the_even_model_when_there_is_one(tmp_path: Path) -> None:
+def test_the_line_can_be_read_before_it_changes_and_the_even_model_is_logged_when_there_is_one(tmp_path: Path) -> None:
     steps = []
-    for index, gain in enumerate(("", "first", "first", "", "second")):
+    for index, gain in enumerate(("", "first", "second", "", "third", "third", "fourth")):
         step = make_step(index)
+        late = dataclasses.replace(step.frame, timestamp_us=(0, 1, 2, 3, 7, 20, 21)[index] * 100_000)
+        step = dataclasses.replace(step, frame=late)
         assert step.model is not None
         model = step.model if index == 1 else dataclasses.replace(step.model, even=None)
         steps.append(dataclasses.replace(step, gain=gain, model=model))
     save(tmp_path / "out.rrd", steps)
-    assert [row[0] for row in columns_of(tmp_path / "out.rrd", "/line", "frame")] == [1, 4]
+    assert [row[0] for row in columns_of(tmp_path / "out.rrd", "/line", "frame")] == [1, 4, 6]
     for entity in ("/camera/even", "/camera/errors/even"):
         assert [row[0] for row in columns_of(tmp_path / "out.rrd", entity, "frame")] == [1]
 
