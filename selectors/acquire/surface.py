@@ -77,7 +77,8 @@ def _score_tiles(
             upper, lower = depth[above, left:stop], depth[below, left:stop]
             per_row = np.float32(1 / max(below - above, 1))
             here[0], here[run + 1] = depth[v, max(left - 1, 0)], depth[v, min(stop, width - 1)]
-            here[1 : run + 1] = depth[v, left:stop]
+            for k in range(run):  # an assignment of slices takes two seconds more to compile
+                here[k + 1] = depth[v, left + k]
             known, near_sq, missed_sq = image_mm[v, left:stop], layers.gap_sq[v, left:stop], miss_sq[v, left:stop]
             spread_mm2, scores = layers.spread_mm2[v, left:stop], score[v, left:stop]
             for k in range(run):  # without a branch, it is computed for many pixels at once

@@ -19,26 +19,23 @@ import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Bools, Ints, Longs
-from selective_depth.selectors.triangulation.flips import GHOST, height, insert, locate, orient
+from selective_depth.selectors.triangulation.flips import GHOST, height, insert, locate
 from selective_depth.selectors.triangulation.rows import row_starts, zip_rows
 
 _LEAST_SHIFT = 3  # the square bins that remember a triangle to start a search from are 8 pixels wide
 
 
-@njit(cache=True, nogil=True)
-def _first_triangle(uv: Ints, n: int, tri: Ints, adj: Ints) -> int:
-    """Make a triangle of points 0, 1 and the first off their line, whose index is returned."""
-    third = 2
-    while third < n and orient(uv, 0, 1, third) == 0:
-        third += 1
-    if third >= n:
+def _first_triangle(uv: Ints, tri: Ints, adj: Ints) -> int:
+    """Make a triangle of points 0, 1 and the first off their line, whose index is returned; -1 without any."""
+    along_u, along_v = (uv - uv[0]).astype(np.int64).T
+    area = along_u[1:2] * along_v - along_u * along_v[1:2]
+    if not area.any():
         return -1
-    a, b, c = 0, 1, third
-    if orient(uv, a, b, c) < 0:
-        a, b = b, a
-    tri[:4] = np.array(((a, b, c), (c, b, GHOST), (a, c, GHOST), (b, a, GHOST)))
-    adj[:4] = np.array(((1, 2, 3), (3, 2, 0), (1, 3, 0), (2, 1, 0)))
-    return third
+    c = int(np.argmax(area != 0))
+    a, b = (0, 1) if area[c] > 0 else (1, 0)
+    tri[:4] = (a, b, c), (c, b, GHOST), (a, c, GHOST), (b, a, GHOST)
+    adj[:4] = (1, 2, 3), (3, 2, 0), (1, 3, 0), (2, 1, 0)
+    return c
 
 
 @njit(cache=True, nogil=True)
@@ -141,7 +138,7 @@ class Mesh:
             _brio_keys(points[:n], keys)
             order = np.argsort(keys)
             ordered = points[order]
-            third = _first_triangle(ordered, n, tri, adj)
+            third = _first_triangle(ordered, tri, adj)
             if third < 0:
                 return None
             count = _insert_all(ordered, 2, n, third, tri, adj, 4, bins, shift, changed)
