@@ -130,10 +130,11 @@ class BatchNeuralGas:
         self.nodes_uv_ -= low
         winner = np.empty(len(points), dtype=np.int32)
         d2 = np.empty((2, len(points)), dtype=np.float32)
+        seeds = _sort_into_bins(points, uv, bin_px, rows, columns)
         done = 0
         while True:
-            bins = _sort_into_bins(self.nodes_mm_, self.nodes_uv_, bin_px, rows, columns)
-            in_bands(_find_two, len(points), self._threads, points, uv, bin_px, rows, columns, *bins, winner, d2)
+            nodes = _sort_into_bins(self.nodes_mm_, self.nodes_uv_, bin_px, rows, columns)
+            in_bands(_find_two, rows * columns, self._threads, rows, columns, seeds, nodes, winner, d2)
             if done == 0:
                 self.reheated_ = _mean_distance(d2[0]) > most
                 passes = COLD_PASSES if self.reheated_ else passes
@@ -155,7 +156,7 @@ def _mean_distance(d2: Floats) -> float:
 
 @njit(cache=True, nogil=True)
 def _sort_into_bins(nodes, nodes_uv, bin_px, rows, columns):  # type: ignore[no-untyped-def]
-    """Nodes ordered by image bin, as first index of each bin, node numbers and coordinates."""
+    """Nodes, or seeds, ordered by image bin: first index of each bin, their numbers and coordinates."""
     count = len(nodes)
     starts = np.zeros(rows * columns + 1, np.int32)
     cell = np.empty(count, np.int32)
@@ -179,42 +180,44 @@ def _sort_into_bins(nodes, nodes_uv, bin_px, rows, columns):  # type: ignore[no-
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz", "contract"})
-def _find_two(  # type: ignore[no-untyped-def]
-    first, end, points, uv, bin_px, rows, columns, starts, number, xyz, winner, d2
-):
-    """Winners of the seeds first..end among the bins around each; distances of the nearest two."""
-    sx, sy, sz = xyz[0], xyz[1], xyz[2]
+def _find_two(first, end, rows, columns, seeds, nodes, winner, d2):  # type: ignore[no-untyped-def]
+    """Winners of the seeds in the bins first..end among the nodes around each; distances of the nearest two."""
+    seed_starts, seed_number, seed_xyz = seeds
+    starts, number, xyz = nodes
     far = np.float32(3e38)
-    per_px = np.float32(1 / bin_px)
-    for p in range(first, end):
-        x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        c = min(int(uv[p, 0] * per_px), columns - 1)
-        r = min(int(uv[p, 1] * per_px), rows - 1)
-        one, two, at = far, far, 0
-        met = 0
-        ring = 0
+    # The nodes around a bin, side by side.
+    near, names = np.empty((3, len(number)), np.float32), np.empty(len(number), np.int32)
+    sx, sy, sz = near[0], near[1], near[2]
+    for b in range(first, end):
+        if seed_starts[b] == seed_starts[b + 1]:
+            continue
+        r, c = b // columns, b % columns
+        met = ring = 0
         while met < _ENOUGH and ring < max(rows, columns):
             ring += 1
-            one, two, at = far, far, 0
             met = 0
             left, right = max(c - ring, 0), min(c + ring, columns - 1)
             for row in range(max(r - ring, 0), min(r + ring, rows - 1) + 1):
-                a = starts[row * columns + left]
-                b = starts[row * columns + right + 1]
-                met += b - a
-                for j in range(a, b):
-                    dx = sx[j] - x
-                    dy = sy[j] - y
-                    dz = sz[j] - z
-                    d = dx * dx + dy * dy + dz * dz
-                    # Choices, not branches: which node is nearer is not predictable.
-                    nearer = d < one
-                    loser = one if nearer else d
-                    two = loser if loser < two else two
-                    at = j if nearer else at
-                    one = d if nearer else one
-        winner[p] = number[at]
-        d2[0, p], d2[1, p] = one, two
+                for j in range(starts[row * columns + left], starts[row * columns + right + 1]):
+                    sx[met], sy[met], sz[met], names[met] = xyz[0, j], xyz[1, j], xyz[2, j], number[j]
+                    met += 1
+        for i in range(seed_starts[b], seed_starts[b + 1]):
+            x, y, z = seed_xyz[0, i], seed_xyz[1, i], seed_xyz[2, i]
+            one, two, at = far, far, 0
+            for j in range(met):
+                dx = sx[j] - x
+                dy = sy[j] - y
+                dz = sz[j] - z
+                d = dx * dx + dy * dy + dz * dz
+                # Choices, not branches: which node is nearer is not predictable.
+                nearer = d < one
+                loser = one if nearer else d
+                two = loser if loser < two else two
+                at = j if nearer else at
+                one = d if nearer else one
+            p = seed_number[i]
+            winner[p] = names[at]
+            d2[0, p], d2[1, p] = one, two
 
 
 @njit(cache=True, nogil=True)

@@ -166,9 +166,11 @@ def test_winners_meet_the_slow_search(count, nodes, bin_px, equal, seed):
     points = rng.normal(size=(count, 3)).astype(np.float32) * (0 if equal else 100)
     places = rng.normal(size=(nodes, 3)).astype(np.float32) * (0 if equal else 100)
     rows = columns = int(40 // bin_px) + 1
-    bins = fast._sort_into_bins(places, nodes_uv, bin_px, rows, columns)
+    seeds_in, nodes_in = (
+        fast._sort_into_bins(*each, bin_px, rows, columns) for each in ((points, uv), (places, nodes_uv))
+    )
     winner, d2 = np.empty(count, np.int32), np.empty((2, count), np.float32)
-    fast._find_two(0, count, points, uv, bin_px, rows, columns, *bins, winner, d2)
+    fast._find_two(0, rows * columns, rows, columns, seeds_in, nodes_in, winner, d2)
     slow = winners_slowly(points, uv, places, nodes_uv, bin_px, rows, columns)
     assert np.allclose(d2[0], slow[:, 0], rtol=1e-4, atol=1e-3)
     some = np.isfinite(slow[:, 1])
