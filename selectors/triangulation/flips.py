@@ -6,6 +6,8 @@ circle) are computed in 64-bit integers and are never wrong: no tolerance, no de
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from selective_depth.drivers.kernels import njit
@@ -28,11 +30,11 @@ def orient(uv: Ints, a: int, b: int, c: int) -> int:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def height(u: Whole, v: Whole) -> int:
+def height(u: Any, v: Any) -> Any:
     """A fixed hash of a pixel: the higher it is, the more it counts as outside of a circle it lies on."""
     h = (u * 0x9E3779B1 + v * 0x85EBCA77) & 0xFFFFFFFF
     h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
-    return int(h >> 16)
+    return h >> 16
 
 
 @njit(cache=True, nogil=True)
@@ -160,7 +162,7 @@ def settle(uv: Ints, tri: Ints, adj: Ints, count: int, sure: Bools) -> None:
             waits[t] = False
             k = 0
             while k < 3:
-                o, p = adj[t, k], tri[t, k]
+                o, p = adj[t, k], int(tri[t, k])
                 # An edge is looked at when the later of its triangles comes. Hull edges stay.
                 if p == GHOST or o > newest or t > newest or (sure[o] and sure[t]):
                     k += 1

@@ -18,21 +18,16 @@ _FAR = 1 << 20  # farther than any row of any image, and its square fits in 64 b
 
 @njit(cache=True, nogil=True)
 def _nearest_row_in_column(first: int, end: int, valid: Bools, nearest_row: Ints) -> None:
-    """Per pixel of the columns first..end, the nearest row of its column with a sample."""
+    """Per pixel of the columns first..end, the nearest row of its column with a sample; `_FAR` without."""
     height = len(valid)
-    last = np.full(end - first, -_FAR, np.int32)
     # Row by row, so that many columns are looked at together; down and up again.
-    for v in range(height):
-        row, nearest = valid[v, first:end], nearest_row[v, first:end]
-        for k in range(len(row)):
-            last[k] = np.int32(v) if row[k] else last[k]
-            nearest[k] = last[k]
-    last[:] = _FAR
-    for v in range(height - 1, -1, -1):
-        row, nearest = valid[v, first:end], nearest_row[v, first:end]
-        for k in range(len(row)):
-            last[k] = np.int32(v) if row[k] else last[k]
-            nearest[k] = last[k] if last[k] - v < v - nearest[k] else nearest[k]
+    for rows in (range(height), range(height - 1, -1, -1)):
+        last = np.full(end - first, _FAR, np.int32)
+        for v in rows:
+            row, nearest = valid[v, first:end], nearest_row[v, first:end]
+            for k in range(len(row)):
+                last[k] = np.int32(v) if row[k] else last[k]
+                nearest[k] = last[k] if abs(last[k] - v) < abs(nearest[k] - v) else nearest[k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -45,10 +40,9 @@ def _nearest_along_rows(first: int, end: int, nearest_row: Ints, nearest: Ints, 
     for v in range(first, end):
         top = -1
         for u in range(width):
-            gap = np.int64(nearest_row[v, u]) - v
-            if gap >= _FAR // 2 or gap <= -(_FAR // 2):
+            if nearest_row[v, u] == _FAR:
                 continue
-            g = gap * gap
+            g = (np.int64(nearest_row[v, u]) - v) ** 2
             begin = np.int64(0)
             while top >= 0:
                 # First integer pixel at which column u beats the envelope's last column. The
@@ -102,7 +96,7 @@ def nearest_sample(valid: Bools, threads: int | None = None) -> tuple[Ints, Ints
     the sample as well: a k-d tree needs about 1 us a pixel.
     """
     height, width = valid.shape
-    nearest_row = np.empty((height, width), np.int32)
+    nearest_row = np.full((height, width), _FAR, np.int32)
     nearest, gap_sq = np.empty((height, width), np.int32), np.empty((height, width), np.int32)
     in_bands(_nearest_row_in_column, width, threads, valid, nearest_row)
     in_bands(_nearest_along_rows, height, threads, nearest_row, nearest, gap_sq)
