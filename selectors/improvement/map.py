@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from selective_depth.drivers.kernels import njit
@@ -154,28 +156,11 @@ def doubtful_cells(padded: Floats, windows: Windows) -> Bytes:
     """
     measured = (padded > 0).astype(np.uint8)
     corners = measured[:-1, :-1] + measured[1:, :-1] + measured[:-1, 1:] + measured[1:, 1:]
-    # At the frame's edge a cell has no far side: its pixels are looked at one by one.
-    down, across = (
-        np.pad(np.diff(axis.centres) ** 2.0, 1, constant_values=np.inf) for axis in (windows.rows, windows.columns)
-    )
-    small = down[:, None] + across <= windows.reach_px**2
     beside = np.pad(corners, 1)
     beside = beside[:-2] | beside[1:-1] | beside[2:]
     near = (beside[:, :-2] | beside[:, 1:-1] | beside[:, 2:]) > 0
     # Every window that a pixel here lies in holds all corners; a system takes two samples.
-    return np.where((corners >= 2) & small, 0, np.where(near, 1, 2)).astype(np.uint8)
-
-
-@njit(cache=True, forceinline=True, nogil=True)
-def near_seed(padded, rows, columns, i, j, y, x, reach_squared):  # type: ignore[no-untyped-def]
-    """Whether any of the 4x4 seeds around cell j below lattice row i is near pixel (y, x)."""
-    for ni in range(max(i - 1, 0), min(i + 3, len(rows))):
-        dy = rows[ni] - y
-        for nj in range(max(j - 2, 0), min(j + 2, len(columns))):
-            dx = columns[nj] - x
-            if padded[ni + 1, nj + 1] > 0 and dx * dx + dy * dy <= reach_squared:
-                return True
-    return False
+    return np.where((corners >= 2) & windows.small, 0, np.where(near, 1, 2)).astype(np.uint8)
 
 
 @njit(cache=True, forceinline=True, nogil=True)
@@ -195,15 +180,24 @@ def mark_known(y, padded, doubtful, lattice, held, line):  # type: ignore[no-unt
         doubt = doubtful[i + 1, j]
         if doubt == 0:
             continue
-        for x in range(columns[j - 1] if j > 0 else 0, columns[j] if j < len(columns) else len(known)):
-            if doubt == 1:
-                total = first_weight[x] * held[first_place[x]] + second_weight[x] * held[second_place[x]]
-                if total > 0 and near_seed(padded, rows, columns, i, j, y, x, reach_squared):
-                    continue
+        start, stop = columns[j - 1] if j > 0 else 0, columns[j] if j < len(columns) else len(known)
+        for x in range(start, stop):
             known[x] = False
-            estimate[x] = np.nan
-            variance[x] = np.nan
-            raw[x] = 0
+        # Of the 4x4 seeds around the cell, each makes known what it reaches of this row.
+        for ni in range(max(i - 1, 0), min(i + 3, len(rows)) if doubt == 1 else 0):
+            left_over = reach_squared - (rows[ni] - y) ** 2
+            half = int(math.sqrt(max(left_over, 0.0)))
+            for nj in range(max(j - 2, 0), min(j + 2, len(columns)) if left_over >= 0 else 0):
+                if padded[ni + 1, nj + 1] > 0:
+                    for x in range(max(columns[nj] - half, start), min(columns[nj] + half + 1, stop)):
+                        total = first_weight[x] * held[first_place[x]] + second_weight[x] * held[second_place[x]]
+                        known[x] = total > 0
+        for x in range(start, stop):
+            estimate[x] = estimate[x] if known[x] else np.float32(np.nan)
+        for x in range(start, stop):
+            variance[x] = variance[x] if known[x] else np.float32(np.nan)
+        for x in range(start, stop):
+            raw[x] = raw[x] if known[x] else np.float32(0)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

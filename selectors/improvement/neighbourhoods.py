@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.selectors.arrays import Doubles, Floats, Longs
+from selective_depth.selectors.arrays import Bools, Doubles, Floats, Longs
 from selective_depth.selectors.improvement.lattice import LANES
 from selective_depth.selectors.improvement.lattice_tables import LatticeTables, build_tables
 from selective_depth.selectors.improvement.systems import MAX_PIXELS, padded_pixels
@@ -164,6 +164,15 @@ class Windows:
                 batches.append(np.pad(batch, (0, LANES - len(batch)), mode="edge"))
                 shape_of.append(shape)
         return np.array(batches, np.int64), np.array(shape_of, np.int64), place
+
+    @cached_property
+    def small(self) -> Bools:
+        """Cells between lattice points that any of their seeds reaches as a whole, shape (R + 1, C + 1)."""
+        # At the frame's edge a cell has no far side: its pixels are looked at one by one.
+        down, across = (
+            np.pad(np.diff(at.centres) ** 2.0, 1, constant_values=np.inf) for at in (self.rows, self.columns)
+        )
+        return np.asarray(down[:, None] + across <= self.reach_px**2)
 
     @cached_property
     def kernel_arguments(self) -> tuple[Any, ...]:

@@ -120,7 +120,9 @@ class ImprovementSelector:
         windows = windows_of(samples, self.exponent)
         # One block: the allocator keeps it for the next frame instead of returning its pages.
         maps, known = np.empty((4, *samples.frame_shape), np.float32), np.empty(samples.frame_shape, np.bool_)
-        padded = np.pad(samples.depth_mm, 1)
+        rows, columns = samples.shape
+        padded = np.zeros((rows + 2, columns + 2), np.float32)
+        padded[1:-1, 1:-1] = samples.depth_mm
         doubtful = doubtful_cells(padded, windows)
         half = _half(samples.depth_mm[samples.valid])
         histograms: list[Ints] = []
