@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import threading
 import time
@@ -88,7 +89,7 @@ class Session:
         self.settings = settings
         self.steering = steering or Steering()
         self.report = RunReport(uri, live=False)
-        self.prepare: Callable[[Pipeline, DepthFrame], None] = Pipeline.warm_up
+        self.prepare: Callable[[Pipeline, DepthFrame], FrameResult] = Pipeline.warm_up
         self.help = ""
         self._uri = uri
         self.last: FrameResult | None = None
@@ -224,7 +225,10 @@ class Session:
                 self._obey(source, pipeline, tell)
                 continue
             if not self._ready_s:
-                self._get_ready(read.frame, pipeline, viewer)
+                shown = self._get_ready(read.frame, source, pipeline, viewer)
+                taken += shown
+                if shown:
+                    continue
                 if self.settings.viewer.record is not None:
                     self._record(True, source, tell, read.frame)
             if not taken and self._recording is not None and not self._recording.has(read.frame):
@@ -344,14 +348,32 @@ class Session:
         self._unfinished.append(threading.Thread(target=draw, name="drawing a picture"))
         self._unfinished[-1].start()
 
-    def _get_ready(self, frame: DepthFrame, pipeline: Pipeline, viewer: Viewer) -> None:
+    def _get_ready(self, frame: DepthFrame, source: DepthSource, pipeline: Pipeline, viewer: Viewer) -> bool:
+        """Compile, fill tables and caches with the first frame; whether that is shown already.
+
+        A sensor's is: when all is ready it is too old to be made again, and whatever takes its time when
+        something is logged for the first time is behind the run then.
+        """
         began_s = time.monotonic()
         with waiting("Compiling for this machine; the next run starts at once"):
-            self.prepare(pipeline, frame)
+            first = self.prepare(pipeline, frame)
             viewer.wait_ready()
-        self._ready_s, self._ready_cpu_s = time.monotonic(), time.process_time()
-        self._recent_s.append(self._ready_s)
+        shown = source.live and self.settings.viewer.record is None
+        if shown:
+            self._start_clock()
+            self._show(replace(first, state=state_of(source)), source, pipeline, viewer)
+            viewer.wait_taken()
+            pipeline.times.clear()
+        gc.collect()
+        gc.freeze()  # else what was imported and compiled is looked through again and again, a tenth of a second each
+        self._start_clock()
         log.info("ready after %.1f s", self._ready_s - began_s)
+        return shown
+
+    def _start_clock(self) -> None:
+        self._ready_s, self._ready_cpu_s = time.monotonic(), time.process_time()
+        self._recent_s.clear()
+        self._recent_s.append(self._ready_s)
 
     def _show(self, result: FrameResult, source: DepthSource, pipeline: Pipeline, viewer: Viewer) -> None:
         """Add what only the run knows of a result, and hand it to report and viewer."""

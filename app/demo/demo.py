@@ -13,7 +13,7 @@ from selective_depth.app.commands.steering import Steering
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.keys import KEYS, pressed
 from selective_depth.app.console.progress import waiting
-from selective_depth.app.pipeline import Pipeline, print_report, say
+from selective_depth.app.pipeline import FrameResult, Pipeline, print_report, say
 from selective_depth.app.settings import DemoOptions, Settings
 from selective_depth.app.viewer import own_address, serving_web_viewer, stream_port
 from selective_depth.drivers.errors import SourceError
@@ -84,11 +84,11 @@ def run_demo(source: str | None, options: DemoOptions, settings: Settings) -> in
     return code
 
 
-def _prepare(pipeline: Pipeline, frame: DepthFrame) -> None:
+def _prepare(pipeline: Pipeline, frame: DepthFrame) -> FrameResult:
     """Compile all that can be switched to, so that switching costs no frame."""
     pipeline.warm_up(frame)
     pipeline.warm_up_all(frame)
-    pipeline.warm_up(frame)
+    return pipeline.warm_up(frame)
 
 
 def _default_source() -> str:

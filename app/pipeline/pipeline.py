@@ -28,6 +28,9 @@ from selective_depth.selectors.selection import Selector, Worth
 EVEN_EVERY, EVEN_EVERY_LIVE = 10, 3
 """One in so many frames of a recording, or of a sensor, is measured evenly as well, to tell what selecting
 gains; a sensor's are for people who look on, a recording's for its report."""
+WARM_FRAMES = 5
+"""How often a sensor's first frame is made: the first few frames of a process are slow, for their memory has to be
+got from the system."""
 
 
 @dataclass(frozen=True)
@@ -127,12 +130,14 @@ class Pipeline:
         self._memory = None
         self._gas = gas_of(self._asked.settings, self._threads)
 
-    def warm_up(self, frame: DepthFrame) -> None:
-        """Compile the kernels, fill the tables and train the first nodes, untimed."""
+    def warm_up(self, frame: DepthFrame) -> FrameResult:
+        """Compile the kernels, fill the tables and train the first nodes, untimed; the frame's result."""
         with compiling_beside():
             self._improvement.select(self._seeds(frame))
-        self.make(frame)
+        for _ in range(WARM_FRAMES if self._realtime else 1):
+            result = self.make(frame)
         self._start_afresh()
+        return result
 
     def warm_up_all(self, frame: DepthFrame) -> None:
         """Compile what other options than the present ones run, so that changing them takes no time."""
@@ -145,6 +150,8 @@ class Pipeline:
         self._start_afresh()
 
     def _start_afresh(self) -> None:
+        if self._even is not None:
+            self._even.result()
         self._memory, self._even, self._counted, self._begun = None, None, None, 0
         self.times.clear()
 

@@ -88,6 +88,11 @@ class Handover(Generic[T]):
             self._queue.append(item)
             self._changed.notify_all()
 
+    def wait_empty(self, timeout_s: float) -> bool:
+        """Wait until the sink has taken everything, or has failed; False if it has not in time."""
+        with self._changed:
+            return self._changed.wait_for(lambda: bool(self.failure) or self._idle(), timeout_s)
+
     def finish(self, timeout_s: float) -> bool:
         """Let the sink take what is waiting, and close it.
 
@@ -106,6 +111,9 @@ class Handover(Generic[T]):
                 self.dropped += len(self._queue) + self._in_hand
                 return False
         return True
+
+    def _idle(self) -> bool:
+        return not self._queue and not self._in_hand
 
     def _full(self) -> bool:
         return self.failure is None and len(self._queue) >= self._capacity
@@ -128,6 +136,7 @@ class Handover(Generic[T]):
     def _next(self) -> T | None:
         with self._changed:
             self._in_hand = 0
+            self._changed.notify_all()
             self._changed.wait_for(lambda: self._queue or self._finishing)
             self._stalled = False
             item = self._queue.popleft() if self._queue else None

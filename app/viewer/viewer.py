@@ -149,6 +149,12 @@ class Viewer:
         for _, way in self._fed:
             way.ready.wait(READY_S)
 
+    def wait_taken(self) -> None:
+        """Wait until every place has taken all that it was handed, though for none that stalls."""
+        deadline_s = time.monotonic() + STALL_S
+        for _, way in self._fed:
+            way.wait_empty(max(0.0, deadline_s - time.monotonic()))
+
     def show(self, item: FrameResult | SensorNote) -> None:
         """Hand a step, or the sensor's state without one, to every place.
 

@@ -67,7 +67,7 @@ def serving_web_viewer(host: str, stream: int) -> Iterator[int]:
     port = free_port(host, WEB_PORTS)
     command = [executable, "--serve-web", "--bind", host, "--web-viewer-port", str(port), local_url(stream)]
     if os.name == "posix":  # it goes when this program does, however that ends: their pipe is closed then
-        command = ["sh", "-c", '"$@" & read -r _; kill $!', "sh", *command]
+        command = ["sh", "-c", '"$@" & read -r _; kill -9 $!; wait $!', "sh", *command]
     quiet = subprocess.DEVNULL
     with interrupt.started_deaf():
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet)
