@@ -84,6 +84,11 @@ def serving_web_viewer(host: str, stream: int) -> Iterator[int]:
 
 
 def web_address(host: str, viewer: int, stream: int) -> str:
-    """What a browser opens to see a stream, both of which it reaches at a host."""
+    """What a browser opens to see a stream, both of which it reaches at a host.
+
+    On this machine the viewer has the other one of its names: to a browser that is another site, which gets
+    a process of its own, so that a page around it is not held up while it paints.
+    """
+    page = {"127.0.0.1": "localhost", "localhost": "127.0.0.1"}.get(host, host)
     joined = quote(f"rerun+http://{host}:{stream}/proxy", safe="")
-    return f"http://{host}:{viewer}/?url={joined}&hide_welcome_screen=1&persist=0&theme=dark"
+    return f"http://{page}:{viewer}/?url={joined}&hide_welcome_screen=1&persist=0&theme=dark"

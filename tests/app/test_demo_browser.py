@@ -134,19 +134,25 @@ def test_every_control_is_obeyed_at_once_and_costs_no_frame(chromium: object, de
     page.until(lambda: page.frames() > 10, "frames", 120)
     page.page.wait_for_timeout(1000)
     skipped = page.skipped()
-    took_s = {}
+    took_s: dict[str, float] = {}
+    lost: dict[str, int] = {}
+
+    def note(name: str, seconds: float) -> None:
+        page.page.wait_for_timeout(700)  # for the frames after it to be counted
+        took_s[name], lost[name] = seconds, page.skipped() - skipped - sum(lost.values())
+
     page.slide("budget", 4)
-    took_s["budget"] = page.until(lambda: "3.0%" in page.text("budget-text"), "the budget")
+    note("budget", page.until(lambda: "3.0%" in page.text("budget-text"), "the budget"))
     page.slide("rounds", 1)
-    took_s["rounds"] = page.until(lambda: page.text("rounds-text") == "Rounds: 3", "the rounds")
+    note("rounds", page.until(lambda: page.text("rounds-text") == "Rounds: 3", "the rounds"))
     for label in ("improvement map", "even lattice", "neural gas, long edges", "surface score"):
         page.choose("by", label)
-        took_s[label] = page.until(lambda label=label: label in page.page.inner_text(".q-select"), label)
+        note(label, page.until(lambda label=label: label in page.page.inner_text(".q-select"), label))
     page.press("memory")
-    took_s["memory"] = page.until(lambda: page.text("gain"), "the memory")
+    note("memory", page.until(lambda: page.text("gain"), "the memory"))
     page.press("memory")
-    page.page.wait_for_timeout(1500)
-    assert page.skipped() - skipped <= 1, f"{page.skipped() - skipped} frames were skipped by switching"
+    note("memory off", 0.0)
+    assert {name: count for name, count in lost.items() if count} == {}, "frames were skipped by switching"
     page.press("paused")
     took_s["pause"] = page.until(lambda: page.text("state") == "paused", "a pause")
     frames = page.frames()
@@ -171,7 +177,7 @@ def test_every_control_is_obeyed_at_once_and_costs_no_frame(chromium: object, de
     assert "times as good" in said and "Traceback" not in said
     (recording,) = (demo.folder / "out").glob("record-*.oni")
     with open_source(recording) as source:
-        assert len(list(source)) >= 20
+        assert len(list(source)) >= 15
 
 
 def test_two_pages_show_the_same_run(chromium: object, demo: Demo) -> None:
@@ -202,9 +208,6 @@ def test_the_page_is_whole_at_every_size(chromium: object, demo: Demo, width: in
     """All controls within the window, nothing over anything else, the viewer showing what is run."""
     page = Page(chromium, demo.address, width, height, seen=True)
     page.until(lambda: "times as good" in page.text("gain"), "the line", 120)
-    page.page.wait_for_timeout(15_000)  # a software renderer is slow to begin
-    PICTURES.mkdir(parents=True, exist_ok=True)
-    page.page.screenshot(path=PICTURES / f"demo-{width}x{height}.png", timeout=120_000)
     boxes = {}
     parts = "gain budget rounds by memory layout hide paused recording snapshot viewer"
     for name in parts.split():
@@ -216,3 +219,6 @@ def test_the_page_is_whole_at_every_size(chromium: object, demo: Demo, width: in
     assert boxes["viewer"]["width"] > width * 0.7 and boxes["viewer"]["height"] > height * 0.8
     line = page.page.locator("[data-name=gain]")
     assert line.evaluate("line => line.scrollWidth <= line.clientWidth"), "the line is cut off"
+    page.page.wait_for_timeout(15_000)  # a software renderer is slow to begin
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    page.page.screenshot(path=PICTURES / f"demo-{width}x{height}.png", timeout=120_000)
