@@ -51,8 +51,8 @@ eq. (1)-(4)); `neural_gas_live` goes on from the last frame; `regions` is Delaun
 
 How exact the timed code is: the map against eq. (13) in float64 in
 [improvement.md](improvement.md), the trainings against a plain float64 loop and against each
-other in [neural-gas.md](neural-gas.md). Times vary from run to run on a shared machine; the
-ratios vary less.
+other in [neural-gas.md](neural-gas.md). How near the stages come to what the machine allows:
+[limits.md](limits.md). Times vary from run to run on a shared machine; the ratios vary less.
 """
 
 
