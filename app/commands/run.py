@@ -11,6 +11,7 @@ from selective_depth.app.console.keys import KEYS, pressed
 from selective_depth.app.console.output import check_output, write_output
 from selective_depth.app.pipeline import is_settings, print_report, say
 from selective_depth.app.settings import AcquireOptions, Settings
+from selective_depth.drivers.oni import check_place
 
 
 def watch(uri: str, settings: Settings) -> int:
@@ -60,6 +61,8 @@ def check(settings: Settings) -> None:
         raise UsageError(f"--far-mm is {far_mm}; it must be more than --near-mm, {near_mm}.")
     if seen.save is not None:
         _check_save(seen.save, seen.overwrite)
+    if seen.record is not None:
+        check_place(seen.record, seen.overwrite)
     if seen.table is not None and seen.table.suffix.lower() != ".parquet":
         raise UsageError(f"--table is '{seen.table}'; it must end in .parquet.")
     check_output(seen.json, seen.table)

@@ -98,6 +98,7 @@ class Session:
         self._recent_s: deque[float] = deque(maxlen=31)
         self._recent: deque[dict[str, float]] = deque(maxlen=30)
         self._governor: Governor | None = None
+        self._table: FigureTable | None = None
         self._recording: Recording | None = None
         self._unfinished: list[threading.Thread] = []
         self._went_by = 0  # frames that a sensor made while the run was paused
@@ -126,11 +127,12 @@ class Session:
                 self._governor = Governor(self.settings.acquire, 1000 / source.fps)
             limits = self.settings.run.frames, source.frame_count
             frames = min((limit for limit in limits if limit is not None), default=None)  # None: nobody knows
-            table = None if seen.table is None else stack.enter_context(writing(seen.table, {"source": self._uri}))
+            if seen.table is not None:
+                self._table = stack.enter_context(writing(seen.table, {"source": self._uri}))
             viewer = self._open_viewer(pipeline, frames)
             try:
                 with interrupt.recognised(), FrameProgress(self._uri, frames, self.help) as progress:
-                    self._flow(source, pipeline, viewer, progress, table)
+                    self._flow(source, pipeline, viewer, progress)
                 if viewer.served_url and not sensor and not self.steering.stopped:
                     say("All frames are served; Ctrl-C ends.")
                     threading.Event().wait()
@@ -149,9 +151,9 @@ class Session:
                 if self._governor is not None and self._governor.most.said:
                     report.given_up, report.given_up_frames = self._governor.most.said, self._governor.frames
                 self._publish(ended=True)
-            if table is not None:
-                table.finish("", {"source": self._uri})
-                report.written += [seen.table] if seen.table and table.rows else []
+            if self._table is not None:
+                self._table.finish("", {"source": self._uri})
+                report.written += [seen.table] if seen.table and self._table.rows else []
             if viewer.options.save is not None and self.last is not None:
                 self._write_beside(viewer.options.save, self.last)
             if seen.save_model is not None and self.last is not None:
@@ -184,14 +186,7 @@ class Session:
             say(f"Serving; join with '{join_command(viewer.served_url)}'.")
         return viewer
 
-    def _flow(
-        self,
-        source: DepthSource,
-        pipeline: Pipeline,
-        viewer: Viewer,
-        progress: FrameProgress,
-        table: FigureTable | None,
-    ) -> None:
+    def _flow(self, source: DepthSource, pipeline: Pipeline, viewer: Viewer, progress: FrameProgress) -> None:
         """Source to pipeline to result to sinks, one frame after the other."""
         feed = Feed(source, self.settings.run.frames)
         state, taken, skipped = state_of(source), 0, 0
@@ -203,8 +198,6 @@ class Session:
         def hand_on(results: Iterable[FrameResult]) -> None:
             for result in results:
                 self._show(result, source, pipeline, viewer)
-                if table is not None:
-                    table.add(figure_row(result))
                 progress.update(self.report.frames, f"{result.figures['fps']:.0f} frames/s")
 
         self._publish(state=state)
@@ -399,6 +392,8 @@ class Session:
         self.report.processor_s = time.process_time() - self._ready_cpu_s
         self.last = told
         viewer.show(told)
+        if self._table is not None:
+            self._table.add(figure_row(told))
         self._publish(
             state=told.state, gain=told.gain, given_up=told.given_up, fps=told.figures["fps"],
             skipped=source.dropped - self.report.dropped_starting - self._went_by,

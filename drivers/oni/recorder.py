@@ -55,7 +55,7 @@ class OniRecorder:
         self.frames = self.missed = 0
         self.failure = ""
         self._overwrite = overwrite
-        _check_place(self.path, overwrite)
+        check_place(self.path, overwrite)
         self._waiting: queue.Queue[DepthFrame | None] = queue.Queue(_WAITING)
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="oni-recorder", daemon=True)
@@ -124,7 +124,14 @@ class OniRecorder:
         self.frames += 1
 
 
-def _check_place(path: Path, overwrite: bool) -> None:
+def check_place(path: Path, overwrite: bool) -> None:
+    """Refuse a place where nothing can be recorded, before there is anything to record.
+
+    Raises
+    ------
+    OutputError
+        Naming it, and what to do.
+    """
     if path.suffix.lower() != ".oni":
         raise OutputError(f"'{path}' must end in .oni to be a recording.")
     if path.is_dir():

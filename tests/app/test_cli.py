@@ -678,6 +678,18 @@ def test_live_sensor_from_the_command_line(
     assert cli.run(["replay", str(recording), *QUICK]) == 0
 
 
+def test_a_recording_is_not_replaced_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "b.oni"
+    out.write_bytes(b"what was there")
+    arguments = ["replay", ENDLESS, *QUICK, "--frames", "3", "--record", str(out)]
+    assert cli.run(arguments) == 1
+    assert "exists already. Give another name, or --overwrite" in capsys.readouterr().err
+    assert out.read_bytes() == b"what was there"
+    assert cli.run([*arguments, "--overwrite"]) == 0
+    with open_source(out) as recorded:
+        assert len(list(recorded)) == 3
+
+
 def test_a_replay_is_recorded_from_its_first_frame_to_its_last(tmp_path: Path) -> None:
     out = tmp_path / "b.oni"
     assert cli.run(["replay", ENDLESS, *QUICK, "--frames", "7", "--start", "3", "--record", str(out)]) == 0
