@@ -119,7 +119,7 @@ class Page:
         return int(found[1].replace(",", "")) if found else 0
 
     def slide(self, name: str, steps: int) -> float:
-        """Move a slider by so many of its steps, each once the run has obeyed the one before; how long the last took."""
+        """Move a slider step by step, each once the run has obeyed the last; returns how long that took."""
         took_s = 0.0
         for _ in range(steps):
             before = self.text(f"{name}-text")
