@@ -69,7 +69,7 @@ def chromium() -> Iterator[object]:
 
 @pytest.fixture
 def demo(tmp_path: Path) -> Iterator[Demo]:
-    slow = ("--budget", "1%", "--rounds", "2", "--speed", "0.3")  # so that the machine has time: a frame lost is by us
+    slow = ("--budget", "1%", "--rounds", "2", "--speed", "0.2")  # so that the machine has time: a frame lost is by us
     made = Demo(tmp_path, str(ROOT / "recordings" / "workstation.oni"), *slow)
     yield made
     for page in Page.opened:
@@ -181,7 +181,7 @@ def test_every_control_is_obeyed_at_once_and_costs_no_frame(chromium: object, de
     assert "times as good" in said and "Traceback" not in said
     (recording,) = (demo.folder / "out").glob("record-*.oni")
     with open_source(recording) as source:
-        assert len(list(source)) >= 15
+        assert len(list(source)) >= 9
 
 
 def test_two_pages_show_the_same_run(chromium: object, demo: Demo) -> None:
