@@ -229,7 +229,7 @@ class ViewerOptions:
     serve_address: Annotated[str | None, optional("HOST:PORT")] = None
     """Where to serve it; by default on this machine only, at 9876 or the next free port."""
     serve_origin: Annotated[str | None, optional("PATTERN")] = None
-    """Where web viewers that may join come from besides this machine, such as http://*:9090."""
+    """Where web viewers that may join come from besides this machine, such as http://192.0.2.7:9090."""
     connect: Annotated[str | None, optional("URL")] = None
     """Send to a viewer that is already open, for example rerun+http://127.0.0.1:9876/proxy."""
     serve_memory: Memory = "256MiB"

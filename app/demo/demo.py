@@ -57,18 +57,19 @@ def run_demo(source: str | None, options: DemoOptions, settings: Settings) -> in
     stream, token = stream_port(host), secrets.token_urlsafe(12) if options.share else ""
     play = replace(settings.play, loop=True, realtime=True)
     steering = Steering()
+    reached = own_address() if options.share else ITSELF
     with serving_web_viewer(host, stream) as viewer_port:
         seen = replace(
             settings.viewer,
             headless=True,
             serve=True,
             serve_address=f"{host}:{stream}",
-            serve_origin=f"http://*:{viewer_port}",
+            serve_origin=f"http://{reached}:{viewer_port}",  # besides localhost's, which always may
         )
         session = Session(uri, replace(settings, viewer=seen, play=play), steering)
         session.prepare = _prepare
         with serving_page(steering, uri, host, options.port, (viewer_port, stream), token) as port:
-            address = f"http://{own_address() if options.share else ITSELF}:{port}/{f'?token={token}' * bool(token)}"
+            address = f"http://{reached}:{port}/{f'?token={token}' * bool(token)}"
             say(f"The page is at {address} ; Ctrl-C ends.")
             if options.share:
                 say(
