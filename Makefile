@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 QUICK := not slow and not hardware and not browser
 WINDOW_PACKAGES := libvulkan1 mesa-vulkan-drivers
-TEST_PACKAGES := libopenni2-0 libopenni2-dev g++ $(WINDOW_PACKAGES) xvfb x11-utils libfaketime
+TEST_PACKAGES := libopenni2-0 libopenni2-dev g++ $(WINDOW_PACKAGES) xvfb x11-utils libfaketime fish
 
 .DEFAULT_GOAL := help
 .PHONY: help typing run test test-browser test-lowest test-slow fuzz lint format system-packages recordings pictures wheel wheel-check docs hooks clean
