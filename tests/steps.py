@@ -10,7 +10,7 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 from selective_depth.app.pictures import palette as legend
-from selective_depth.app.pipeline import STAGES, Even, FrameResult, Model, StageTimes
+from selective_depth.app.pipeline import STAGES, FrameResult, Model, StageTimes
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer import Viewer
 from selective_depth.drivers.frame import Camera, DepthFrame
@@ -55,7 +55,7 @@ def make_step(index: int, *, acquiring: bool = True) -> FrameResult:
             by="step score",
         )
         error_mm = np.where(known, 12.5, np.nan).astype(np.float32)
-        even = Even(depth_mm.astype(np.float32) + 50, 4 * error_mm, 50.0)
+        even = Model(depth_mm.astype(np.float32) + 50, 4 * error_mm, 50.0)
         model = Model(depth_mm.astype(np.float32), error_mm, 12.5, even=even)
     return FrameResult(
         frame,

@@ -335,8 +335,12 @@ class Session:
         path, title = unused("picture", ".png"), self._title(last)
 
         def draw() -> None:
-            write_picture(path, contact_sheet([row_of(last, title)]))
-            tell(f"Wrote {path}.")
+            try:
+                write_picture(path, contact_sheet([row_of(last, title)]))
+            except OutputError as error:
+                tell(str(error))
+            else:
+                tell(f"Wrote {path}.")
 
         self._unfinished.append(threading.Thread(target=draw, name="drawing a picture"))
         self._unfinished[-1].start()

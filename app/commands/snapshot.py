@@ -13,7 +13,7 @@ from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import IMAGES, check_picture, make_folder, write_image
 from selective_depth.app.console.progress import waiting
 from selective_depth.app.pictures import Row, StillRow, alone, contact_rows, sheet, write_picture
-from selective_depth.app.pipeline import Even, FrameResult, Pipeline, open_and_tell, say
+from selective_depth.app.pipeline import FrameResult, Model, Pipeline, open_and_tell, say
 from selective_depth.app.settings import PanelOptions, Settings
 from selective_depth.drivers.errors import SourceEndedError
 from selective_depth.drivers.frame import DepthFrame
@@ -58,7 +58,7 @@ def row_of(result: FrameResult, title: str) -> StillRow:
     if acquisition is None:
         return StillRow(title, frame, result.regions, result.improvement)
     selective_mm = acquisition.reconstruct() if result.model is None else result.model.depth_mm
-    models = (("even", Even.of(frame, len(acquisition.uv)).depth_mm), ("selective", selective_mm))
+    models = (("even", Model.of_even(frame, len(acquisition.uv)).depth_mm), ("selective", selective_mm))
     exact = None
     if result.memory is not None and frame.truth_mm is not None:
         exact = replace(frame, depth_mm=np.where(frame.depth_mm > 0, frame.truth_mm, np.uint16(0)))

@@ -172,7 +172,7 @@ def unused(stem: str, ending: str) -> Path:
         If there is no making it.
     """
     make_folder(FOLDER)
-    return FOLDER / f"{stem}-{datetime.now():%Y%m%d-%H%M%S}{ending}"
+    return FOLDER / f"{stem}-{datetime.now():%Y%m%d-%H%M%S-%f}{ending}"  # to the microsecond, so that none is taken
 
 
 class Recording:

@@ -67,29 +67,29 @@ def run_demo(source: str | None, options: DemoOptions, settings: Settings) -> in
             serve_origin=f"http://{reached}:{viewer_port}",  # besides localhost's, which always may
         )
         session = Session(uri, replace(settings, viewer=seen, play=play), steering)
-        session.prepare = _prepare
         with serving_page(steering, uri, host, options.port, (viewer_port, stream), token) as port:
             address = f"http://{reached}:{port}/{f'?token={token}' * bool(token)}"
-            say(f"The page is at {address} ; Ctrl-C ends.")
-            if options.share:
-                say(
-                    f"Open in this network: the page on port {port}, to those who have its address with the token;"
-                    f" the viewer on port {viewer_port} and the stream it shows on port {stream}, to everyone."
-                )
-            if not options.no_browser and not options.share:
-                webbrowser.open(address)
+
+            def prepare(pipeline: Pipeline, frame: DepthFrame) -> FrameResult:
+                """Say where the page is, now that there is something to see; compile all that can be switched to."""
+                if options.share:
+                    say(
+                        f"Open in this network: the page on port {port}, to those who have its address with the token;"
+                        f" the viewer on port {viewer_port} and the stream it shows on port {stream}, to everyone."
+                    )
+                say(f"The page is at {address} ; Ctrl-C ends.")
+                if not options.share and not options.no_browser:
+                    webbrowser.open(address)
+                pipeline.warm_up(frame)
+                pipeline.warm_up_all(frame)
+                return pipeline.warm_up(frame)
+
+            session.prepare = prepare
             with pressed(steering.press) as keys:
                 session.help = KEYS if keys else ""
                 code = session.run()
     print_report(session.report)
     return code
-
-
-def _prepare(pipeline: Pipeline, frame: DepthFrame) -> FrameResult:
-    """Compile all that can be switched to, so that switching costs no frame."""
-    pipeline.warm_up(frame)
-    pipeline.warm_up_all(frame)
-    return pipeline.warm_up(frame)
 
 
 def _default_source() -> str:

@@ -13,12 +13,11 @@ from selective_depth.app.pipeline.report import (
     save_settings,
     say,
 )
-from selective_depth.app.pipeline.result import Even, FrameResult, Model, SensorNote
+from selective_depth.app.pipeline.result import FrameResult, Model, SensorNote
 from selective_depth.app.pipeline.timing import STAGES, StageSummary, StageTimes
 
 __all__ = [
     "STAGES",
-    "Even",
     "Feed",
     "FrameResult",
     "Governor",

@@ -16,7 +16,8 @@ def figures_of(result: FrameResult) -> dict[str, float]:
     tables of `archive` have the same names, and are described there.
     """
     acquisition, model, size = result.acquisition, result.model, result.frame.depth_mm.size
-    nan = math.nan
+    nan, even = math.nan, None if model is None else model.even
+    to_truth = result.memory is not None and result.frame.truth_mm is not None  # as the line takes the model's
     seeds = 0 if result.memory is not None else result.seeds.valid.size  # a memory's first frame begins it
     measured = result.seeds.valid.size if acquisition is None else len(acquisition.uv)
     return {
@@ -32,5 +33,5 @@ def figures_of(result: FrameResult) -> dict[str, float]:
         "mae_mm": nan if model is None else model.mae_mm,
         "truth_rmse_mm": nan if model is None else model.truth_rmse_mm,
         "sensor_rmse_mm": nan if model is None else model.sensor_rmse_mm,
-        "even_rmse_mm": nan if model is None or model.even is None else model.even.rmse_mm,
+        "even_rmse_mm": nan if even is None else even.truth_rmse_mm if to_truth else even.rmse_mm,
     }

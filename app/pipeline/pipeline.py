@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline.governor import ALL, Eased
-from selective_depth.app.pipeline.result import Even, FrameResult, Model
+from selective_depth.app.pipeline.result import FrameResult, Model
 from selective_depth.app.pipeline.selecting import NAMES, gas_of, improvement_of, selector_of
 from selective_depth.app.pipeline.timing import StageTimes
 from selective_depth.app.pipeline.warm_up import compiling_beside
@@ -96,7 +96,7 @@ class Pipeline:
         self._beside: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(2, thread_name_prefix="beside")
         self._evening: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(1, thread_name_prefix="even")
         self._under_way: deque[Callable[[], FrameResult]] = deque()
-        self._even: Future[Even] | None = None
+        self._even: Future[Model] | None = None
         self._counted: int | None = None
         self._begun = 0
 
@@ -283,16 +283,15 @@ class Pipeline:
 
     def _beside_even(self, asked: _Asked, frame: DepthFrame, model: Model, measurements: int) -> Model:
         """Now and then an even lattice's model is made as well; the model's frame gets it when it is there."""
-        options = asked.settings.acquire
+        asked_every = asked.settings.acquire.even_every
         usual = EVEN_EVERY_LIVE if self._realtime else EVEN_EVERY
-        every = usual if options.even_every is None else options.even_every
+        every = usual if asked_every is None else asked_every
         if self._counted is None:  # of a recording by its own numbers, so that parts of it make what the whole makes
             self._counted = 0 if self._realtime else frame.index
         due = bool(every) and self._counted % (every * asked.eased.model_every) == 0
         self._counted += 1
         if due and self._even is None:
-            to_truth = options.memory == "still" and frame.truth_mm is not None
-            self._even = self._evening.submit(Even.of, frame, measurements, to_truth, self._threads)
+            self._even = self._evening.submit(Model.of_even, frame, measurements, self._threads)
         if self._even is None or (self._realtime and not self._even.done()):
             return model
         even, self._even = self._even.result(), None

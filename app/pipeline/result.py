@@ -20,32 +20,6 @@ from selective_depth.selectors.seeds import SeedGrid
 
 
 @dataclass(frozen=True, eq=False)
-class Even:
-    """The dense model of an even lattice of as many measurements as were spent by selection.
-
-    Parameters
-    ----------
-    depth_mm : float32 array of shape (height, width)
-        Depth at every pixel.
-    error_mm : float32 array of shape (height, width)
-        As of `Model`.
-    rmse_mm : float
-        As of `Model`; or, where that is asked for, against the truth.
-    """
-
-    depth_mm: npt.NDArray[np.float32]
-    error_mm: npt.NDArray[np.float32]
-    rmse_mm: float
-
-    @classmethod
-    def of(cls, frame: DepthFrame, measurements: int, to_truth: bool = False, threads: int | None = None) -> Even:
-        """Measure a frame evenly and model it."""
-        uv = even_lattice(frame.shape, measurements)
-        made = Model.of(reconstruct(uv, frame.measure(uv), frame.shape, threads=threads), frame)
-        return cls(made.depth_mm, made.error_mm, made.truth_rmse_mm if to_truth else made.rmse_mm)
-
-
-@dataclass(frozen=True, eq=False)
 class Model:
     """The dense model made of all samples of a frame, and how far it is from that frame.
 
@@ -62,7 +36,7 @@ class Model:
         with depth; NaN where no truth is known.
     mae_mm : float
         Mean of `error_mm`; NaN for a frame without depth.
-    even : Even or None
+    even : Model or None
         The even lattice's, where one was made: of this frame, or of one shortly before it where
         frames do not wait.
     """
@@ -73,7 +47,7 @@ class Model:
     truth_rmse_mm: float = math.nan
     sensor_rmse_mm: float = math.nan
     mae_mm: float = math.nan
-    even: Even | None = None
+    even: Model | None = None
 
     @classmethod
     def of(cls, depth_mm: npt.NDArray[np.float32], frame: DepthFrame) -> Model:
@@ -89,6 +63,12 @@ class Model:
         off_mm = error_mm[known]
         mae_mm = float(off_mm.mean(dtype=np.float64)) if off_mm.size else math.nan
         return cls(depth_mm, error_mm, _rms(off_mm), *to_truth, mae_mm)
+
+    @classmethod
+    def of_even(cls, frame: DepthFrame, measurements: int, threads: int | None = None) -> Model:
+        """The model of an even lattice of so many measurements of a frame."""
+        uv = even_lattice(frame.shape, measurements)
+        return cls.of(reconstruct(uv, frame.measure(uv), frame.shape, threads=threads), frame)
 
 
 def _rms(off_mm: npt.NDArray[np.floating]) -> float:

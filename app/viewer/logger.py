@@ -12,7 +12,7 @@ import pyarrow as pa
 import rerun as rr
 
 from selective_depth.app.pictures import palette as legend
-from selective_depth.app.pipeline import STAGES, Even, FrameResult, Model
+from selective_depth.app.pipeline import STAGES, FrameResult, Model
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.blueprint import Shown, blueprint, epoch_blueprint
 from selective_depth.drivers.colour import jpeg_of
@@ -294,7 +294,7 @@ def _as_depth(value_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
     return np.where(value_mm > 0, value_mm, np.float32(0)).astype(np.uint16)
 
 
-def _error_image(model: Model | Even, against: DepthFrame | None) -> rr.SegmentationImage:
+def _error_image(model: Model, against: DepthFrame | None) -> rr.SegmentationImage:
     """How far a model is off from its own frame, or from the truth of another."""
     if against is None or against.truth_mm is None:
         return _level_image(legend.ERROR, model.error_mm, ~np.isnan(model.error_mm))

@@ -95,8 +95,8 @@ def test_the_token_becomes_a_cookie_that_no_script_and_no_other_page_gets() -> N
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[int, str]]:
-    """The command as people start it: its port, and what it has printed."""
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[int, Path]]:
+    """The command as people start it: its port, and the file of what it prints."""
     folder = tmp_path_factory.mktemp("demo")
     command = [sys.executable, "-m", "selective_depth.app", "demo", str(ROOT / "recordings" / "workstation.oni")]
     command += ["--no-browser", "--port", "18080"]
@@ -104,10 +104,10 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[int, str]]:
         process = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
     try:
         deadline_s = time.monotonic() + 60
-        while not (found := re.search(r"http://127.0.0.1:(\d+)/", (folder / "log").read_text())):
+        while not (found := re.search(r"The page is at http://127.0.0.1:(\d+)/", (folder / "log").read_text())):
             assert process.poll() is None and time.monotonic() < deadline_s, (folder / "log").read_text()
             time.sleep(0.1)
-        yield int(found[1]), (folder / "log").read_text()
+        yield int(found[1]), folder / "log"
     finally:
         process.terminate()
         process.wait(30)
@@ -121,7 +121,7 @@ def get(port: int, **headers: str) -> tuple[int, str]:
     return answer.status, answer.read().decode()
 
 
-def test_the_page_is_there_with_its_controls_and_the_viewer(demo: tuple[int, str]) -> None:
+def test_the_page_is_there_with_its_controls_and_the_viewer(demo: tuple[int, Path]) -> None:
     status, text = get(demo[0])
     assert status == 200
     for name in ("budget", "rounds", "by", "memory", "layout", "hide", "paused", "reset", "recording", "snapshot"):
@@ -129,12 +129,34 @@ def test_the_page_is_there_with_its_controls_and_the_viewer(demo: tuple[int, str
     assert "rerun%2Bhttp" in text and "googleapis" not in text
 
 
-def test_the_page_refuses_names_and_origins_that_are_not_its_own(demo: tuple[int, str]) -> None:
+def test_the_page_refuses_names_and_origins_that_are_not_its_own(demo: tuple[int, Path]) -> None:
     assert get(demo[0], Host="evil.example")[0] == 403
     assert get(demo[0], Origin="http://evil.example")[0] == 403
 
 
-def test_nothing_of_it_listens_to_the_network(demo: tuple[int, str]) -> None:
+def test_only_the_pages_own_viewer_reads_the_stream(demo: tuple[int, Path]) -> None:
+    """The stream itself tells browsers whose pages may: those of this machine, on no other's behalf."""
+    joined = re.search(r"rerun\+http://127.0.0.1:(\d+)/proxy", demo[1].read_text())
+    viewer = re.search(r"http://localhost:(\d+)/\?url=", get(demo[0])[1])
+    assert joined is not None and viewer is not None
+
+    def allowed(origin: str) -> bool:
+        connection = http.client.HTTPConnection("127.0.0.1", int(joined[1]), timeout=20)
+        asks = {"Origin": origin, "Access-Control-Request-Method": "POST"}
+        connection.request("OPTIONS", "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages", headers=asks)
+        return connection.getresponse().getheader("access-control-allow-origin") == origin
+
+    assert allowed(f"http://localhost:{viewer[1]}") and allowed(f"http://127.0.0.1:{viewer[1]}")
+    assert not allowed("http://evil.example") and not allowed(f"http://evil.example:{viewer[1]}")
+
+
+def test_a_source_that_is_not_there_has_no_page(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert cli.run(["demo", str(tmp_path / "no.oni"), "--no-browser"]) == 1
+    shown = capsys.readouterr()
+    assert "does not exist" in shown.err and "The page is at" not in shown.out
+
+
+def test_nothing_of_it_listens_to_the_network(demo: tuple[int, Path]) -> None:
     """All ports that the demo's processes listen on are loopback's; what is open otherwise is somebody else's."""
     table = Path("/proc/net/tcp").read_text().splitlines()[1:]
     listening = {tuple(line.split()[1].split(":")) for line in table if line.split()[3] == "0A"}

@@ -24,7 +24,7 @@ from selective_depth.app.console import interrupt
 from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes, timing
 from selective_depth.app.pipeline.governor import Eased
 from selective_depth.app.pipeline.pipeline import EVEN_EVERY_LIVE, Pipeline
-from selective_depth.app.pipeline.result import Even
+from selective_depth.app.pipeline.result import Model
 from selective_depth.app.settings import AcquireOptions, GasOptions, RunOptions, SeedOptions, Settings, ViewerOptions
 from selective_depth.app.viewer import Viewer
 from selective_depth.drivers.errors import (
@@ -197,13 +197,13 @@ def test_a_model_has_no_error_where_the_frame_has_no_depth() -> None:
 
 
 def test_a_sensors_frame_does_not_wait_for_the_even_model_and_one_gets_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    go_on, plain = threading.Event(), Even.of
+    go_on, plain = threading.Event(), Model.of_even
 
-    def slow(*what: Any) -> Even:
+    def slow(*what: Any) -> Model:
         go_on.wait(10)
         return plain(*what)
 
-    monkeypatch.setattr(Even, "of", slow)
+    monkeypatch.setattr(Model, "of_even", slow)
     with Pipeline(ACQUIRING, realtime=True) as pipeline:
         models = [pipeline.make(make_frame(index)).model for index in range(EVEN_EVERY_LIVE + 1)]
         assert all(model is not None and model.even is None for model in models)
