@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 PATIENCE_S = 10.0
 """How long a scheduler may take to answer."""
 TOPIC = "selective-depth"
+_LOGGED = {"logging": dict.fromkeys(("distributed", "tornado", "asyncio", "bokeh"), "critical")}
+"""One line each is ours to say."""
 _QUIET = {
-    # One line each is ours to say.
-    "logging": {"distributed": "critical", "tornado": "critical", "asyncio": "critical", "bokeh": "critical"},
     # Dask's own has malloc give back what every frame needs again.
     "distributed.nanny.pre-spawn-environ": {f"{each}_NUM_THREADS": 1 for each in ("OMP", "MKL", "OPENBLAS")},
     "distributed.comm.timeouts.connect": f"{PATIENCE_S:g}s",
@@ -65,13 +65,15 @@ def engine(scheduler: str | None = None, workers: int | None = None) -> Iterator
         os.environ.setdefault(f"DASK_{name}", value)
     import dask
 
+    # What is logged is read on importing it. The rest is set after that: what is set before takes all of Dask's own
+    # settings with it when it is undone, from under threads that are still ending.
+    with dask.config.set(_LOGGED):
+        from distributed import Client, LocalCluster
     with dask.config.set(_QUIET):
         if scheduler is not None:
             with _there(scheduler) as client:
                 yield client
             return
-        from distributed import Client, LocalCluster
-
         with interrupt.started_deaf(), waiting("Starting the workers"):
             cluster = LocalCluster(
                 n_workers=workers or default_threads(),

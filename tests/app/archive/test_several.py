@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -54,3 +56,15 @@ def test_options_of_a_source_are_not_those_of_where_it_goes(tmp_path: Path) -> N
 def test_replay_of_several_names_batch(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["replay", "a.oni", "b.oni"]) == 2
     assert "'replay' takes one source, and 'b.oni' is another; 'batch' takes several" in capsys.readouterr().err
+
+
+def test_the_engine_leaves_dasks_own_settings_as_they_are() -> None:
+    """Its threads, which may be ending still, look things up there. In a process that has not imported it yet."""
+    script = (
+        "import contextlib\nfrom selective_depth.app.archive.engine import engine\n"
+        "from selective_depth.app.console.errors import UsageError\n"
+        "with contextlib.suppress(UsageError), engine('no address'): pass\n"
+        "import dask\nprint('comm' in dask.config.config['distributed'])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.stdout == "True\n", done.stderr
