@@ -266,8 +266,11 @@ class Session:
 
     def _obey(self, source: DepthSource, pipeline: Pipeline, tell: Callable[[str], None]) -> None:
         """Do what was asked for since the last frame."""
-        wishes = self.steering.take()
-        for name, value in wishes:
+        for asked in self.steering.take():
+            meant = self.steering.meant(asked[1]) if asked[0] == "key" else asked
+            if meant is None:
+                continue
+            name, value = meant
             if name == "paused":
                 self.steering.paused = value
             elif name == "stop":
@@ -281,8 +284,7 @@ class Session:
                     tell(str(error))
             else:
                 self._change(changed(self.settings, name, value), pipeline)
-        if wishes:
-            self._publish()
+            self._publish()  # for the next key, and for those who look on
 
     def _change(self, settings: Settings, pipeline: Pipeline) -> None:
         if settings.acquire != self.settings.acquire:

@@ -118,9 +118,13 @@ class Steering:
 
     def press(self, key: str) -> None:
         """Ask for what a key of the terminal stands for; see `console.keys.KEYS`."""
+        self._asked.put(("key", key))
+
+    def meant(self, key: str) -> tuple[str, Any] | None:
+        """What a key stands for as things are now, when it is its turn; None of a key that is none."""
         status = self.status
         if status is None:
-            return
+            return None
         spend = status.acquire
         wishes: dict[str, tuple[str, Any]] = {
             " ": ("paused", not self.paused),
@@ -136,8 +140,7 @@ class Steering:
             "x": ("reset", None),
             "q": ("stop", None),
         }
-        if key in wishes:
-            self.ask(*wishes[key])
+        return wishes.get(key)
 
     def take(self) -> list[tuple[str, Any]]:
         """What was asked for since the last call."""

@@ -215,19 +215,29 @@ def test_everything_that_can_be_switched_to_is_compiled_before() -> None:
 )  # fmt: skip
 def test_keys_ask_for_what_they_say(key: str, expected: tuple[str, Any]) -> None:
     steering = Steering()
-    steering.press(key)  # before the run has begun
+    assert steering.meant(key) is None  # before the run has begun
     steering.status = Status(SMALL.acquire, SMALL.viewer)
-    steering.press(key)
-    steering.press("?")
-    assert steering.take() == [expected]
+    assert steering.meant(key) == expected
+    assert steering.meant("?") is None
+
+
+def test_keys_that_come_faster_than_frames_are_all_obeyed() -> None:
+    with running(LIVE) as (_, steering, status):
+        for key in "++]s?rr":
+            steering.press(key)
+        until(lambda: status().acquire.by == NAMES[1], "the last of them")
+        assert (status().acquire.budget, status().acquire.rounds) == (0.2, 3)
+        until(
+            lambda: any("Recorded" in each or "holds no frame" in each for each in status().news), "a recording's end"
+        )
+        assert not status().recording
 
 
 def test_budgets_end_at_their_ends() -> None:
     steering = Steering()
     for budget, key in ((BUDGETS[-1], "+"), (0.0, "-")):
         steering.status = Status(AcquireOptions(budget=budget), SMALL.viewer)
-        steering.press(key)
-        assert steering.take() == [("budget", budget)]
+        assert steering.meant(key) == ("budget", budget)
 
 
 def test_keys_of_a_real_terminal_steer_a_run_and_leave_it_as_it_was(tmp_path: Path) -> None:
