@@ -131,23 +131,25 @@ class SurfacePlan:
     ----------
     score : float32 array of shape (height, width)
         Worth of a shot at each pixel, as of the last `look`.
+    surface : Surface
+        The model, as of the last `look` or `model_mm`.
     """
 
     def __init__(self, rule: SurfaceSelector, samples: Samples) -> None:
         shape = samples.frame_shape
         self._rule = rule
         self._samples = samples
-        self._surface = Surface(shape, rule.threads)
+        self.surface = Surface(shape, rule.threads)
         self._miss_sq = np.full(shape, FAR_SQ, np.int32)
         self._seen = 0
         self.score = np.zeros(shape, np.float32)
 
     def look(self) -> None:
         """Take in what was measured since, and score again what that changes."""
-        samples, layers = self._samples, self._surface.layers
+        samples, layers = self._samples, self.surface.layers
         radius = math.ceil(2 * samples.reach_px)
         for uv, depth_mm in samples.added_since(self._seen):
-            self._surface.add(uv, depth_mm)
+            self.surface.add(uv, depth_mm)
             _note_misses(uv, depth_mm, radius, self._miss_sq, layers.touched)
         self._seen = samples.additions
         tiles = np.flatnonzero(layers.touched)
@@ -164,6 +166,6 @@ class SurfacePlan:
     def model_mm(self) -> Floats:
         """Dense depth of the samples as they are now, float32 (height, width); a copy."""
         for uv, depth_mm in self._samples.added_since(self._seen):
-            self._surface.add(uv, depth_mm)
+            self.surface.add(uv, depth_mm)
         self._seen = self._samples.additions
-        return self._surface.layers.depth_mm.copy()
+        return self.surface.layers.depth_mm.copy()

@@ -103,9 +103,12 @@ class Extent:
     ----------
     shape : tuple of int
         Height and width of the frame.
+    threads : int, optional
+        Kernel threads; default `default_threads()`.
     """
 
-    def __init__(self, shape: tuple[int, int]) -> None:
+    def __init__(self, shape: tuple[int, int], threads: int | None = None) -> None:
+        self._threads = threads
         self._looked = np.zeros(shape, np.bool_)
         self._against = np.zeros(shape, np.bool_)
 
@@ -116,12 +119,20 @@ class Extent:
 
     def changed(self) -> tuple[Bools, Floats]:
         """Where the nearest look contradicted, and how far a border of it is from any look."""
-        nearest, gap_sq = nearest_sample(self._looked)
+        nearest, gap_sq = nearest_sample(self._looked, self._threads)
         changed = self._against.ravel()[nearest]
-        border = np.zeros(changed.shape, np.bool_)
-        for axis in range(2):
-            one, other = ((slice(None),) * axis + (part,) for part in (slice(1, None), slice(-1)))
-            differ = changed[one] != changed[other]
-            border[one] |= differ
-            border[other] |= differ
-        return changed, np.where(border & (gap_sq > 1), np.sqrt(gap_sq), 0).astype(np.float32)
+        border_px = np.empty(changed.shape, np.float32)
+        _border(changed, gap_sq, border_px)
+        return changed, border_px
+
+
+@njit(cache=True, nogil=True)
+def _border(changed: Bools, gap_sq: Ints, border_px: Floats) -> None:
+    """How far each pixel beside one that is otherwise lies from any look; 0 elsewhere, and beside a look."""
+    height, width = changed.shape
+    for v in range(height):
+        above, here, below = changed[max(v - 1, 0)], changed[v], changed[min(v + 1, height - 1)]
+        for u in range(width):
+            beside = here[max(u - 1, 0)], here[min(u + 1, width - 1)], above[u], below[u]
+            differs = beside[0] != here[u] or beside[1] != here[u] or beside[2] != here[u] or beside[3] != here[u]
+            border_px[v, u] = np.sqrt(np.float32(gap_sq[v, u])) if differs and gap_sq[v, u] > 1 else np.float32(0)

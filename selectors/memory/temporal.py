@@ -17,7 +17,7 @@ from scipy.ndimage import maximum_filter
 from selective_depth.drivers.frame import Camera
 from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.arrays import Bools, Bytes, Floats, Ints, pixels_where
-from selective_depth.selectors.choice import choose
+from selective_depth.selectors.choice import best_pixels
 from selective_depth.selectors.memory.change import (
     BESIDE,
     MARGIN_PX,
@@ -34,7 +34,7 @@ from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import REACH, Samples, seed_pitch_px
 from selective_depth.selectors.seeds import Measure, SeedGrid, answers
 from selective_depth.selectors.selection import Selector, Worth, plan_of
-from selective_depth.selectors.triangulation import Surface
+from selective_depth.selectors.triangulation import TILE_PX, Surface
 
 CALM_LOOKS, ALERT_LOOKS = 0.15, 0.3
 """Share of a frame's budget that looks out, in a still scene and for `ALERT_FRAMES` after a
@@ -43,7 +43,7 @@ ALERT_FRAMES = 3
 EXTENT_ROUNDS = 3
 """Rounds of shots along the border of what has changed."""
 MOST_LOST = 1000
-"""Points of the mesh that stand in holes by now, before it is made anew without them."""
+"""Points of the mesh that stand in holes by now, before they are taken out of it."""
 PROBATION = 8
 """Frames without a sign of motion before the memory is relied on, where the budget pays for a fresh
 start in every frame: a hand may hold a camera still for a moment."""
@@ -205,6 +205,7 @@ class TemporalAcquisition:
         self._still = 0
         self._memory = Memory.of(self.shape)
         self._surface = Surface(self.shape, self.threads)
+        self._worth = np.empty(self.shape, np.float32)
         self._by = ""
 
     def step(self, measure: Measure) -> TemporalStep:
@@ -229,6 +230,7 @@ class TemporalAcquisition:
         restarted = self._frame == 0 or not self._look_out(sensor, changed)
         if restarted:
             self._memory = Memory.of(self.shape)
+            self._surface = Surface(self.shape, self.threads)
             self._still = 0
             changed[:] = True
         settled = self._probation < self._still  # never after a restart
@@ -237,7 +239,9 @@ class TemporalAcquisition:
             if moved:
                 self._alert = ALERT_FRAMES
                 forget(self._memory, changed)
-            self._book(sensor, 0, anew=moved)
+                self._surface.remove(pixels_where(changed))
+            self._book(sensor, 0)
+            self._surface.layers.touched[:] = True  # all has aged by a frame
             for left in range(self.rounds if moved else 1, 0, -1):
                 self._measure_best(sensor, (self._shots - sensor.spent) // left)
             model_mm = self._surface.layers.depth_mm.copy()
@@ -290,14 +294,14 @@ class TemporalAcquisition:
         confirmed = np.pad(votes, NEAR_PX)[at[..., 1], at[..., 0]].sum(axis=1) >= FEWEST_CONFIRMED
         if not confirmed.any():
             return True
-        extent = Extent(self.shape)
+        extent = Extent(self.shape, self.threads)
         extent.add(uv, against)
         extent.add(beside, beside_against)
         extent.add(doubted, confirmed)
         for left in range(EXTENT_ROUNDS, 0, -1):
             _, border_px = extent.changed()
             shots = (self._shots - sensor.spent) // (left + 1)
-            new = sensor.unasked(choose(border_px, shots))
+            new = sensor.unasked(best_pixels(border_px, shots))
             extent.add(new, contradicts(new, sensor(new), model_mm))
         where, _ = extent.changed()
         changed[:] = maximum_filter(where, 2 * MARGIN_PX + 1)
@@ -311,29 +315,31 @@ class TemporalAcquisition:
             sensor, seeds, rounds=self.rounds, selector=self.selector, shots=shots, threads=self.threads
         )
         self._by = acquisition.by
-        self._book(sensor, 0, anew=True)
-        return acquisition.reconstruct(self.threads)
+        model_mm = acquisition.reconstruct(self.threads)
+        if acquisition.plan is not None and not self._surface.points:  # it holds the same samples
+            self._surface = acquisition.plan.surface
+        self._book(sensor, 0)
+        return model_mm
 
-    def _book(self, sensor: _Sensor, first: int, *, anew: bool = False) -> None:
+    def _book(self, sensor: _Sensor, first: int) -> None:
         """Take in this frame's answers from number `first` on, and draw the model."""
         uv = np.concatenate([np.empty((0, 2), np.int32), *sensor.uv[first:]])
         mm = np.concatenate([np.empty(0, np.float32), *sensor.depth_mm[first:]])
         book(self._memory, uv, mm, self._frame)
-        if anew:  # no point is ever taken out of a mesh
-            self._surface = Surface(self.shape, self.threads)
-            uv = pixels_where(self._memory.held)
         self._surface.put(uv, self._memory.fused_mm[uv[:, 1], uv[:, 0]])
+        self._surface.layers.touched[uv[:, 1] // TILE_PX, uv[:, 0] // TILE_PX] = True
         if self._surface.points - np.count_nonzero(self._memory.held) > MOST_LOST:
-            self._book(sensor, len(sensor.uv), anew=True)
+            self._surface.remove(pixels_where(self._memory.held == 0))
 
     def _measure_best(self, sensor: _Sensor, shots: int) -> None:
         """Measure the pixels that are worth most, and draw what comes of it."""
         if shots <= 0:
             return
-        worth = np.empty(self.shape, np.float32)
-        layers, noise = self._surface.layers, (self.noise.floor_mm, self.noise.per_mm)
-        known = self._memory, layers.depth_mm, layers.gap_sq
-        in_bands(shot_worth, len(worth), self.threads, *known, self._reach_sq, noise, self._frame, WRONG, worth)
+        worth, layers, noise = self._worth, self._surface.layers, (self.noise.floor_mm, self.noise.per_mm)
+        tiles = np.flatnonzero(layers.touched)
+        layers.touched[:] = False
+        what = tiles, self._memory, layers, self._reach_sq, noise, self._frame, WRONG, worth
+        in_bands(shot_worth, len(tiles), self.threads, *what)
         first = len(sensor.uv)
         if self.selector is not None:
             samples = Samples(self.shape, self._pitch_px)
@@ -341,7 +347,7 @@ class TemporalAcquisition:
             samples.add(pixels_where(held), self._memory.fused_mm[held])
             new = plan_of(self.selector, samples).best(shots // 2)
             sensor(sensor.unasked(new))
-            worth[self._memory.held == 0] = 0
+            worth = np.where(self._memory.held > 0, worth, np.float32(0))
             shots -= shots // 2
-        sensor(choose(worth, shots))
+        sensor(best_pixels(worth, shots))
         self._book(sensor, first)

@@ -15,8 +15,9 @@ import numpy as np
 from scipy.special import betainc
 
 from selective_depth.drivers.kernels import njit
-from selective_depth.selectors.arrays import Floats, Ints
+from selective_depth.selectors.arrays import Floats, Longs
 from selective_depth.selectors.memory.store import KEPT, Memory
+from selective_depth.selectors.triangulation import TILE_PX, Layers
 
 PRIOR = 0.5
 """Of the beta distribution: as if half an observation had been made of either surface."""
@@ -59,29 +60,30 @@ WRONG = _wrong()
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def shot_worth(
-    first_row: int,
-    end_row: int,
+    first: int,
+    end: int,
+    tiles: Longs,
     memory: Memory,
-    model_mm: Floats,
-    gap_sq: Ints,
+    layers: Layers,
     reach_sq: float,
     noise: tuple[float, float],
     now: int,
     wrong: Floats,
     worth: Floats,
 ) -> None:
-    """Score some rows: squared millimetres that a shot is expected to remove.
+    """Score the pixels of some tiles: squared millimetres that a shot is expected to remove.
 
     Parameters
     ----------
-    first_row, end_row : int
-        The rows.
+    first, end : int
+        Which of the tiles.
+    tiles : int64 array
+        Tiles of `TILE_PX` pixels a side, numbered row by row.
     memory : Memory
         What is known.
-    model_mm : float32 array of shape (H, W)
-        The model drawn through it.
-    gap_sq : int32 array of shape (H, W)
-        Squared distance to the nearest known pixel.
+    layers : Layers
+        The model drawn through it, float32 (H, W), and the squared distance to the nearest known
+        pixel, int32 (H, W).
     reach_sq : float
         No shot farther than this from one.
     noise : tuple of float
@@ -93,29 +95,35 @@ def shot_worth(
     worth : float32 array of shape (H, W)
         Filled in.
     """
+    model_mm, gap_sq = layers.depth_mm, layers.gap_sq
     height, width = model_mm.shape
     floor_mm, per_mm = noise
-    for v in range(first_row, end_row):
-        top, bottom = max(v - 1, 0), min(v + 1, height - 1)
-        for u in range(width):
-            if memory.asked[v, u] == now or gap_sq[v, u] > reach_sq:
-                worth[v, u] = 0
-                continue
-            z = model_mm[v, u]
-            low = high = z
-            for y in range(top, bottom + 1):
-                for x in range(max(u - 1, 0), min(u + 2, width)):
-                    low, high = min(low, model_mm[y, x]), max(high, model_mm[y, x])
-            sigma = floor_mm + per_mm * z * z
-            noise_mm2 = sigma * sigma
-            step_mm2 = np.float32(0.25) * (high - low) * (high - low)
-            n, shots = memory.held[v, u], memory.held[v, u] + memory.missed[v, u]
-            if n == 0:
-                expected = NEW_STEP * step_mm2 + NEW_FLAT * noise_mm2
-            else:
-                dissent = memory.dissent[v, u]
-                apart_mm2 = memory.apart_mm2[v, u] if dissent > 0 else step_mm2
-                expected = apart_mm2 * wrong[n, dissent] + SHARED * noise_mm2 / n
-                age = np.float32(now - memory.asked[v, u])
-                expected *= np.float32(1) + age / np.float32(AGED_FRAMES)
-            worth[v, u] = expected / np.float32(shots + 1)
+    columns = layers.touched.shape[1]
+    lows, highs = np.empty((2, TILE_PX + 2), np.float32)  # of three rows, in each column
+    for tile in tiles[first:end]:
+        top, left = tile // columns * TILE_PX, tile % columns * TILE_PX
+        stop = min(left + TILE_PX, width)
+        for v in range(top, min(top + TILE_PX, height)):
+            upper, here, lower = model_mm[max(v - 1, 0)], model_mm[v], model_mm[min(v + 1, height - 1)]
+            for k in range(stop - left + 2):
+                u = min(max(left + k - 1, 0), width - 1)
+                lows[k], highs[k] = min(upper[u], here[u], lower[u]), max(upper[u], here[u], lower[u])
+            for u in range(left, stop):
+                if memory.asked[v, u] == now or gap_sq[v, u] > reach_sq:
+                    worth[v, u] = 0
+                    continue
+                z, k = here[u], u - left
+                low, high = min(lows[k], lows[k + 1], lows[k + 2]), max(highs[k], highs[k + 1], highs[k + 2])
+                sigma = floor_mm + per_mm * z * z
+                noise_mm2 = sigma * sigma
+                step_mm2 = np.float32(0.25) * (high - low) * (high - low)
+                n, shots = memory.held[v, u], memory.held[v, u] + memory.missed[v, u]
+                if n == 0:
+                    expected = NEW_STEP * step_mm2 + NEW_FLAT * noise_mm2
+                else:
+                    dissent = memory.dissent[v, u]
+                    apart_mm2 = memory.apart_mm2[v, u] if dissent > 0 else step_mm2
+                    expected = apart_mm2 * wrong[n, dissent] + SHARED * noise_mm2 / n
+                    age = np.float32(now - memory.asked[v, u])
+                    expected *= np.float32(1) + age / np.float32(AGED_FRAMES)
+                worth[v, u] = expected / np.float32(shots + 1)

@@ -1,4 +1,4 @@
-"""Delaunay triangulation of pixels that grows point by point, exactly.
+"""Delaunay triangulation of pixels that grows, and shrinks, point by point, exactly.
 
 Adding the shots of a round to the triangulation of the samples so far costs a fifth of a
 microsecond each, where a triangulation from scratch would cost the whole frame again. Of points on
@@ -20,6 +20,7 @@ import numpy.typing as npt
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Bools, Ints, Longs
 from selective_depth.selectors.triangulation.flips import GHOST, height, insert, locate
+from selective_depth.selectors.triangulation.removal import remove_all
 from selective_depth.selectors.triangulation.rows import row_starts, zip_rows
 
 _LEAST_SHIFT = 3  # the square bins that remember a triangle to start a search from are 8 pixels wide
@@ -157,6 +158,34 @@ class Mesh:
             self.uv, self.points, end, -1, self.tri, self.adj, self.triangles, self.bins, self.shift, self.changed
         )
         self.points = end
+
+    def remove(self, gone: Ints) -> Ints | None:
+        """Take points out; those that stay move up, and keep their order.
+
+        Parameters
+        ----------
+        gone : int array of shape (n,)
+            Numbers of the points, each once.
+
+        Returns
+        -------
+        int32 array of shape (4,), or None
+            Columns and rows (first, last, top, bottom) outside of which the hull is as it was; the
+            first after the last if all of it is. None where the points that stay may lie on one
+            line; then the mesh is spoilt.
+        """
+        box_px = np.array([1 << 30, -1, 1 << 30, -1], np.int32)
+        self.triangles = remove_all(self.uv, gone, self.tri, self.adj, self.triangles, self.changed, box_px)
+        if self.triangles < 0:
+            return None
+        self.bins[self.bins >= self.triangles] = 0
+        stays = np.ones(self.points, np.bool_)
+        stays[gone] = False
+        names = np.append(np.cumsum(stays, dtype=np.int32) - 1, np.int32(GHOST))
+        self.tri[: self.triangles] = names[self.tri[: self.triangles]]
+        self.points -= len(gone)
+        self.uv[: self.points] = self.uv[: len(stays)][stays]
+        return box_px
 
     def real_triangles(self) -> Ints:
         """Vertices of the triangles inside the hull, shape (t, 3)."""

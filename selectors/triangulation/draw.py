@@ -99,6 +99,27 @@ def _bridges(uv: Ints, z_mm: Floats, a: int, b: int, c: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def change_within(box_px: Ints, uv: Ints, tri: Ints, changed: Bools) -> None:
+    """Say that the triangles changed whose extent meets a box: columns and rows, first, last, top, bottom."""
+    for t in range(len(tri)):
+        a, b, c = tri[t, 0], tri[t, 1], tri[t, 2]
+        if a != GHOST and b != GHOST and c != GHOST:
+            changed[t] |= (
+                min(uv[a, 0], uv[b, 0], uv[c, 0]) <= box_px[1]
+                and max(uv[a, 0], uv[b, 0], uv[c, 0]) >= box_px[0]
+                and min(uv[a, 1], uv[b, 1], uv[c, 1]) <= box_px[3]
+                and max(uv[a, 1], uv[b, 1], uv[c, 1]) >= box_px[2]
+            )
+
+
+@njit(cache=True, nogil=True)
+def change_about(other: Bools, tri: Ints, changed: Bools) -> None:
+    """Say that the triangles changed of which a corner did; `other` has one more for the ghost."""
+    for t in range(len(tri)):
+        changed[t] |= other[tri[t, 0]] | other[tri[t, 1]] | other[tri[t, 2]]
+
+
+@njit(cache=True, nogil=True)
 def sort_out(changed: Bools, uv: Ints, z_mm: Floats, tri: Ints, kind: Bytes, drawn: Ints) -> int:
     """Say of what kind each changed triangle is, and list those to be drawn; their number is returned."""
     count = 0

@@ -17,7 +17,15 @@ from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Floats, Ints
 from selective_depth.selectors.parallel import at_once, in_bands
 from selective_depth.selectors.triangulation.delaunay import Mesh
-from selective_depth.selectors.triangulation.draw import TILE_PX, Layers, draw, sort_out, touch
+from selective_depth.selectors.triangulation.draw import (
+    TILE_PX,
+    Layers,
+    change_about,
+    change_within,
+    draw,
+    sort_out,
+    touch,
+)
 from selective_depth.selectors.triangulation.nearest import FAR_SQ, nearest_sample
 
 MANY = 1000
@@ -95,6 +103,22 @@ def _claim(layers: Layers, uv: Ints) -> None:
                 v += direction
 
 
+@njit(cache=True, nogil=True)
+def _draw_far(layers: Layers) -> None:
+    """Draw what is not linear: as the nearest sample, whatever has become of that."""
+    samples_mm, nearest, _, depth_mm, plain, _, touched = layers
+    height, width = depth_mm.shape
+    for v in range(height):
+        for u in range(width):
+            name = nearest[v, u]
+            if plain[v, u]:
+                continue
+            z = samples_mm[name // width, name % width] if name >= 0 else np.float32(0)
+            if depth_mm[v, u] != z:
+                depth_mm[v, u] = z
+                touch(touched, v, u, v, u)
+
+
 class Surface:
     """A dense model that samples can be added to.
 
@@ -153,14 +177,38 @@ class Surface:
             if self._mesh is not None:
                 other = np.zeros(len(self._uv) + 1, np.bool_)  # and one for the ghost, which is -1
                 other[point[again][differ]] = True
-                a, b, c = self._mesh.tri[: self._mesh.triangles].T
-                self._mesh.changed[: self._mesh.triangles] |= other[a] | other[b] | other[c]
+                mesh = self._mesh
+                change_about(other, mesh.tri[: mesh.triangles], mesh.changed)
         self._insert(uv[point < 0], depth_mm[point < 0])
         self._draw_changed()
         if differ.any():
-            layers, far = self.layers, ~self.layers.plain
-            layers.depth_mm[far] = layers.samples_mm.ravel()[layers.nearest[far]]
-            layers.touched[:] = True
+            _draw_far(self.layers)
+
+    def remove(self, uv: Ints) -> None:
+        """Take samples out again: pixels (n, 2), column first; those that are no sample are passed over."""
+        gone = self._point[uv[:, 1], uv[:, 0]]
+        gone = np.unique(gone[gone >= 0])
+        if not len(gone):
+            return
+        layers = self.layers
+        u, v = self._uv[gone].T
+        self._point[v, u], layers.samples_mm[v, u] = -1, 0
+        self._uv, self._depth_mm = np.delete(self._uv, gone, axis=0), np.delete(self._depth_mm, gone)
+        self._point[self._uv[:, 1], self._uv[:, 0]] = np.arange(len(self._uv))
+        layers.nearest[:], layers.gap_sq[:] = nearest_sample(layers.samples_mm > 0, self._threads)
+        mesh = self._mesh
+        box_px = mesh.remove(gone) if mesh is not None and len(gone) <= len(self._uv) else None
+        if mesh is None or box_px is None:
+            self._mesh = Mesh.of(self._uv, 2 * len(self._uv), layers.depth_mm.shape)
+            layers.plain[:], layers.spread_mm2[:] = False, 0
+        else:  # within the box some of what lay inside the hull may lie outside
+            left, right, top, bottom = box_px
+            box = slice(top, bottom + 1), slice(left, right + 1)
+            layers.plain[box], layers.spread_mm2[box] = False, 0
+            change_within(box_px, mesh.uv, mesh.tri[: mesh.triangles], mesh.changed)
+        self._draw_changed()
+        _draw_far(layers)
+        layers.touched[:] = True
 
     def _insert(self, uv: Ints, depth_mm: Floats) -> None:
         """Take in samples without drawing them."""

@@ -287,7 +287,7 @@ def test_what_is_scored_again_is_what_the_whole_map_would_say(seed: int) -> None
         uv = plan.best(150)
         samples.add(uv, depth[uv[:, 1], uv[:, 0]])
     plan.look()
-    layers = plan._surface.layers
+    layers = plan.surface.layers
     down, along = np.gradient(layers.depth_mm.astype(float))
     slope = np.maximum(np.hypot(down, along), 1e-3)
     rows, columns = np.indices(depth.shape)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.virtual.source import VirtualSource
 from selective_depth.selectors.acquire import acquire
+from selective_depth.selectors.arrays import pixels_where
 from selective_depth.selectors.even import EvenSelector
 from selective_depth.selectors.improvement import ImprovementSelector
 from selective_depth.selectors.memory import TemporalAcquisition
@@ -20,7 +21,7 @@ from selective_depth.selectors.memory.worth import WRONG, shot_worth
 from selective_depth.selectors.neural_gas import LongEdgeSelector, NeuralGasSelector
 from selective_depth.selectors.quality import errors_of
 from selective_depth.selectors.seeds import SeedGrid
-from selective_depth.selectors.triangulation import Surface
+from selective_depth.selectors.triangulation import Mesh, Surface
 
 SMALL = (96, 128)
 SEEDS = (24, 32)
@@ -97,11 +98,10 @@ def test_the_chance_of_a_wrong_majority_falls_with_agreement() -> None:
 
 
 def worth_of(memory: Memory, model_mm: np.ndarray, now: int = 9) -> np.ndarray:
-    gap_sq = np.zeros(model_mm.shape, np.int32)
+    layers = Surface(model_mm.shape).layers._replace(depth_mm=model_mm, gap_sq=np.zeros(model_mm.shape, np.int32))
     worth = np.empty(model_mm.shape, np.float32)
-    shot_worth(
-        0, len(model_mm), memory, model_mm, gap_sq, 40.0, (1.0, 1.4e-6), now, WRONG, worth
-    )  # fmt: skip
+    tiles = np.arange(layers.touched.size)
+    shot_worth(0, len(tiles), tiles, memory, layers, 40.0, (1.0, 1.4e-6), now, WRONG, worth)
     return worth
 
 
@@ -157,24 +157,73 @@ def test_the_extent_of_a_change_follows_its_looks() -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_a_surface_whose_samples_change_equals_one_made_anew(seed: int) -> None:
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_a_surface_whose_samples_change_equals_one_made_anew(seed: int, lattice: bool) -> None:
+    """Samples come, get another depth, and are taken out again, on the hull and inside."""
     rng = np.random.default_rng(seed)
     surface, known = Surface(SMALL), np.zeros(SMALL, np.float32)
-    batches: list[np.ndarray] = []
-    for _ in range(4):
-        count = int(rng.integers(1, 400))
-        pixels = rng.choice(known.size, count, replace=False)
-        uv = np.stack((pixels % SMALL[1], pixels // SMALL[1]), axis=-1).astype(np.int32)
-        mm = rng.choice(np.array([0, 900, 1000, 1030, 4000], np.float32), count)
-        batches.append(uv[(known[uv[:, 1], uv[:, 0]] == 0) & (mm > 0)])
+    for _ in range(6):
+        if lattice and not known.any():
+            known[:: int(rng.integers(1, 6)), :: int(rng.integers(2, 6))] = 1000
+            surface.add(pixels_where(known > 0), known[known > 0])
+        uv = pixels_in_a_bunch(rng)
+        mm = rng.choice(np.array([0, 900, 1000, 1030, 4000], np.float32), len(uv))
         known[uv[:, 1], uv[:, 0]] = np.where(mm > 0, mm, known[uv[:, 1], uv[:, 0]])
         surface.put(uv, mm)
-        anew = Surface(SMALL)
-        for new in batches:  # in the same order: four samples on a circle may be split either way
-            anew.add(new, known[new[:, 1], new[:, 0]])
-        for name in ("depth_mm", "plain", "nearest", "samples_mm"):
-            np.testing.assert_array_equal(getattr(surface.layers, name), getattr(anew.layers, name), err_msg=name)
+        assert_same(surface, known)
+        out = pixels_in_a_bunch(rng)
+        known[out[:, 1], out[:, 0]] = 0
+        surface.remove(out)
+        assert_same(surface, known)
+        assert surface.points == np.count_nonzero(known)
+
+
+def pixels_in_a_bunch(rng: np.random.Generator) -> np.ndarray:
+    """Some pixels of a small frame, each once: of a box, which may be all of it."""
+    (top, bottom), (left, right) = (np.sort(rng.choice(size + 1, 2, replace=False)) for size in SMALL)
+    box = np.zeros(SMALL, bool)
+    box[top:bottom, left:right] = rng.random((bottom - top, right - left)) < rng.choice([0.02, 0.1, 1.0])
+    return pixels_where(box)
+
+
+def assert_same(surface: Surface, known: np.ndarray) -> None:
+    """Farther than a dozen pixels from all samples, a pixel now and then may take the second nearest."""
+    anew = Surface(SMALL)
+    anew.add(pixels_where(known > 0), known[known > 0])
+    for name in ("samples_mm", "gap_sq", "depth_mm", "plain", "spread_mm2"):
+        off = getattr(surface.layers, name) != getattr(anew.layers, name)
+        assert not off[anew.layers.gap_sq < 12**2].any(), name
+        assert np.count_nonzero(off) < off.size / 1000, name
+
+
+def test_what_is_taken_out_leaves_the_triangulation_of_the_rest() -> None:
+    rng = np.random.default_rng(7)
+    uv = pixels_where(rng.random(SMALL) < 0.2)
+    mesh = Mesh.of(uv)
+    assert mesh is not None
+    while len(uv) > 40:
+        gone = rng.choice(len(uv), len(uv) // 5, replace=False).astype(np.int32)
+        mesh.remove(gone)
+        uv = np.delete(uv, gone, axis=0)
+        np.testing.assert_array_equal(mesh.uv[: mesh.points], uv)
+        left = {frozenset(map(tuple, uv[triangle])) for triangle in mesh.real_triangles()}
+        anew = Mesh.of(uv)
+        assert anew is not None
+        assert left == {frozenset(map(tuple, uv[triangle])) for triangle in anew.real_triangles()}
+
+
+@pytest.mark.parametrize("left", [0, 1, 2, 3])
+def test_a_mesh_that_would_be_a_line_is_none(left: int) -> None:
+    uv = np.array([[2 * u, 5] for u in range(left)] + [[3, 1], [4, 9]], np.int32)
+    surface = Surface(SMALL)
+    surface.add(uv, np.full(len(uv), 1000, np.float32))
+    surface.remove(uv[left:])
+    assert (surface.layers.depth_mm == (1000 if left else 0)).all()
+    assert surface.points == left
+    surface.add(uv[left:], np.full(2, 1000, np.float32))
+    anew = Surface(SMALL)
+    anew.add(uv, np.full(len(uv), 1000, np.float32))
+    np.testing.assert_array_equal(surface.layers.plain, anew.layers.plain)
 
 
 SELECTORS = {
