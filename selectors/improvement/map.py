@@ -283,10 +283,9 @@ def best_threshold(raw, histogram, wanted):  # type: ignore[no-untyped-def]
     edge[0] = (level + 1) << LEVEL_SHIFT
     if level == 0 or above == wanted:
         return edge.view(np.float32)[0]
-    # Within the level by the lower bits, of which all values have a count: to sort them, as fast,
-    # takes seconds to compile.
-    lower = np.zeros(1 << LEVEL_SHIFT, np.int32)
-    below = np.uint32(len(lower) - 1)
+    # Within the level, bit by bit: to sort its members, as fast, takes seconds to compile.
+    members = np.empty(histogram[level], np.uint32)
+    count = 0
     bits = raw.view(np.uint32)
     level_bits = np.uint32(level)
     for start in range(0, len(bits), BLOCK):
@@ -299,10 +298,16 @@ def best_threshold(raw, histogram, wanted):  # type: ignore[no-untyped-def]
             continue
         for n in range(len(block)):
             if block[n] >> LEVEL_SHIFT == level_bits:
-                lower[block[n] & below] += ONE
-    at = len(lower) - 1
-    while above + lower[at] <= wanted:
-        above += lower[at]
-        at -= 1
-    edge[0] = (level << LEVEL_SHIFT) + at + 1
+                members[count] = block[n]
+                count += 1
+    least = np.uint32(level << LEVEL_SHIFT)
+    for bit in range(LEVEL_SHIFT - ONE, -1, -1):
+        higher = least + (np.uint32(1) << np.uint32(bit))
+        reached = np.int64(0)
+        for n in range(count):
+            reached += np.int64(members[n] >= higher)
+        # More than is wanted: the threshold lies higher.
+        if above + reached > wanted:
+            least = higher
+    edge[0] = least + ONE
     return edge.view(np.float32)[0]
