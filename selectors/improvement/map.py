@@ -99,7 +99,7 @@ def krige_row(i, padded, lattice, frame_shape, scratch, strip, held):  # type: i
         between, first = tables.between[geometry], tables.first_pixel[geometry]
         a, b = fit_samples(samples[2], samples[3], gathered, between)
         box = Box(columns[j] - lefts[j] + 1, rows[i] - up + 1, width, height)
-        krige_window(samples, gathered, a, b, between, tables.distances, first, box, frame_shape, window_scratch, False)
+        krige_window(samples, gathered, a, b, between, tables.distances, first, box, frame_shape, window_scratch)
         for row in range(height):
             for column in range(width):
                 p = (row + 1) * (width + 2) + column + 1

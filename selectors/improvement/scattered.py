@@ -15,6 +15,7 @@ import numpy.typing as npt
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Bools, Floats, Longs, checked_map, sample_pairs
 from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_over
+from selective_depth.selectors.improvement.sums import improve_by_sums
 from selective_depth.selectors.improvement.systems import MAX_SAMPLES, Box, krige_window, sample_buffers, window_scratch
 from selective_depth.selectors.improvement.variogram import fit_samples
 from selective_depth.selectors.parallel import in_bands
@@ -218,7 +219,9 @@ def _map_rows(first_row, end_row, measured, asked, lattice, by_sums, scratch, ma
                         distances[n, p] = line[reach + x - u[n]]
                         p += 1
             box = Box(start, top, width, height)
-            krige_window(samples, count, a, b, between, distances, 0, box, measured.shape, work, by_sums)
+            krige_window(samples, count, a, b, between, distances, 0, box, measured.shape, work)
+            if by_sums:
+                improve_by_sums(samples, count, a, b, box, work)
             for y in range(y0, y1):
                 gap = up[i] if y < rows[i] else down[i]
                 share_y = count * (1.0 - abs(y - rows[i]) / gap)

@@ -19,20 +19,6 @@ zero at every sample and for every j that is one, free of inverses, and good in 
 The neighbourhood m of a pixel is itself and its four neighbours inside the image. An estimate
 below half the least depth around (an overshoot beside a very deep step) is raised to that, so
 that eq. (11) never divides by nothing.
-
-Erratum: eq. (27), the paper's expansion of eq. (23) for w = 2, ends in
-``+ 2b / var(s) - b^2 / (var(s) z(s))``. The first term is a misprint for ``2b / z(s)``: it
-undoes ``gamma(s, s) = b`` in the sums before it, whose term j = s is (var(s) - b)^2 / z(s)
-over var(s) instead of var(s)^2. The tests compare both with eq. (13).
-
-With w = 2 the covariances of a pixel are linear in where j is, so that eq. (27) needs but sums
-over the p_j. Counted from s, with ``d = s - sum_i lambda_i p_i``, the distance from s to where the
-samples' places are estimated by the same weights,
-
-    cov(s,j) = var(s) - b + 2 a d . (j - s)      for j != s,
-
-exact as w -> 2 where b > 0 (`_improve_by_sums`). Without a nugget the variance vanishes as fast
-as that formula's error, and eq. (23) is taken.
 """
 
 from __future__ import annotations
@@ -56,14 +42,9 @@ BLOCK = 4
 MAX_PIXELS = 16384
 """Most pixels in one window, rim included."""
 
-MOMENTS_NUGGET = 3.0
-"""Least b / a, in square pixels, for which eq. (27) is taken.
-
-At w = 1.999 it is then within .1 % of eq. (13), whose terms of h^w - h^2 it leaves out."""
-
 # The rows of U stand this far apart in one array: constant, so that the compiler can see that
 # the rows a loop writes are not those it reads; and one cache line off a power of two.
-_STRIDE = MAX_PIXELS + 304
+STRIDE = MAX_PIXELS + 304
 
 
 VECTOR = 16
@@ -100,11 +81,9 @@ def window_scratch(pixels: int) -> tuple[npt.NDArray[Any], ...]:
         # Estimate, variance, improvement; 1 / estimate, 0 where it does not count; the covariances
         # with the pixel to the right and the one below.
         *aligned_zeros(6, pixels),
-        aligned_empty(MAX_SAMPLES * _STRIDE),  # U
+        aligned_empty(MAX_SAMPLES * STRIDE),  # U
         np.zeros((MAX_SAMPLES, MAX_SAMPLES), np.float64),  # L, its diagonal inverted
         np.zeros(MAX_SAMPLES, np.float64),  # L^-1 (Z - z_ref)
-        aligned_zeros(2, pixels),  # columns and rows by the same weights, from the reference on
-        np.zeros((2, MAX_SAMPLES), np.float64),  # L^-1 of the samples' columns and rows
     )
 
 
@@ -162,12 +141,12 @@ def _subtract_block(block, earlier, rows, k, pixels):  # type: ignore[no-untyped
     g20, g21, g22, g23 = np.float32(f20), np.float32(f21), np.float32(f22), np.float32(f23)
     g30, g31, g32, g33 = np.float32(f30), np.float32(f31), np.float32(f32), np.float32(f33)
     for p in range(pixels):
-        e0, e1 = earlier[p], earlier[_STRIDE + p]
-        e2, e3 = earlier[2 * _STRIDE + p], earlier[3 * _STRIDE + p]
+        e0, e1 = earlier[p], earlier[STRIDE + p]
+        e2, e3 = earlier[2 * STRIDE + p], earlier[3 * STRIDE + p]
         block[p] -= g00 * e0 + g01 * e1 + g02 * e2 + g03 * e3
-        block[_STRIDE + p] -= g10 * e0 + g11 * e1 + g12 * e2 + g13 * e3
-        block[2 * _STRIDE + p] -= g20 * e0 + g21 * e1 + g22 * e2 + g23 * e3
-        block[3 * _STRIDE + p] -= g30 * e0 + g31 * e1 + g32 * e2 + g33 * e3
+        block[STRIDE + p] -= g10 * e0 + g11 * e1 + g12 * e2 + g13 * e3
+        block[2 * STRIDE + p] -= g20 * e0 + g21 * e1 + g22 * e2 + g23 * e3
+        block[3 * STRIDE + p] -= g30 * e0 + g31 * e1 + g32 * e2 + g33 * e3
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -179,17 +158,17 @@ def _solve_block(block, corner, pixels):  # type: ignore[no-untyped-def]
     l31, l32 = np.float32(corner[3, 1]), np.float32(corner[3, 2])
     for p in range(pixels):
         r0 = d0 * block[p]
-        r1 = d1 * (block[_STRIDE + p] - l10 * r0)
-        r2 = d2 * (block[2 * _STRIDE + p] - l20 * r0 - l21 * r1)
-        block[3 * _STRIDE + p] = d3 * (block[3 * _STRIDE + p] - l30 * r0 - l31 * r1 - l32 * r2)
+        r1 = d1 * (block[STRIDE + p] - l10 * r0)
+        r2 = d2 * (block[2 * STRIDE + p] - l20 * r0 - l21 * r1)
+        block[3 * STRIDE + p] = d3 * (block[3 * STRIDE + p] - l30 * r0 - l31 * r1 - l32 * r2)
         block[p] = r0
-        block[_STRIDE + p] = r1
-        block[2 * _STRIDE + p] = r2
+        block[STRIDE + p] = r1
+        block[2 * STRIDE + p] = r2
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def krige_window(  # type: ignore[no-untyped-def]
-    samples, count, a, b, between, distances, first, box, frame_shape, scratch, by_sums
+    samples, count, a, b, between, distances, first, box, frame_shape, scratch
 ):
     """Krige one window; results in the first three arrays of `scratch`.
 
@@ -211,12 +190,9 @@ def krige_window(  # type: ignore[no-untyped-def]
         Pixels outside the frame are no neighbours.
     scratch : tuple
         `window_scratch`.
-    by_sums : bool
-        Take eq. (27), where the nugget allows it, instead of eq. (23).
     """
     u, v, z, row_of = samples
-    estimate, variance, improvement, _, right, below, U, L, y, places, along = scratch
-    by_sums = by_sums and b >= MOMENTS_NUGGET * a > 0
+    estimate, variance, improvement, _, right, below, U, L, y = scratch
     stride = box.width + 2
     pixels = (stride * (box.height + 2) + VECTOR - 1) // VECTOR * VECTOR
     scale, nugget = np.float32(a), np.float32(b)
@@ -226,11 +202,6 @@ def krige_window(  # type: ignore[no-untyped-def]
     blocks = (m + BLOCK - 1) // BLOCK
     L[m : blocks * BLOCK] = 0
     y[m : blocks * BLOCK] = 0
-    if by_sums:
-        places[:] = 0
-        along[:] = 0
-        _whiten(u, m, L, along[0])
-        _whiten(v, m, L, along[1])
     ref = distances[row_of[0], first : first + pixels + stride]
     for p in range(pixels):
         toward = scale * ref[p] + nugget
@@ -243,7 +214,7 @@ def krige_window(  # type: ignore[no-untyped-def]
         below[p] = scale * (ref[p] + ref[p + stride]) - step
 
     for k in range(0, blocks * BLOCK, BLOCK):
-        block = U[k * _STRIDE : (k + BLOCK) * _STRIDE]
+        block = U[k * STRIDE : (k + BLOCK) * STRIDE]
         # Rows that fill the last block up are the reference's own, and nothing.
         n0, n1 = row_of[k + 1], row_of[k + 2] if k + 1 < m else row_of[0]
         n2 = row_of[k + 3] if k + 2 < m else row_of[0]
@@ -254,38 +225,31 @@ def krige_window(  # type: ignore[no-untyped-def]
         h2, h3 = distances[n2, first : first + pixels], distances[n3, first : first + pixels]
         for p in range(pixels):
             block[p] = c0 + scale * (ref[p] - h0[p])
-            block[_STRIDE + p] = c1 + scale * (ref[p] - h1[p])
-            block[2 * _STRIDE + p] = c2 + scale * (ref[p] - h2[p])
-            block[3 * _STRIDE + p] = c3 + scale * (ref[p] - h3[p])
+            block[STRIDE + p] = c1 + scale * (ref[p] - h1[p])
+            block[2 * STRIDE + p] = c2 + scale * (ref[p] - h2[p])
+            block[3 * STRIDE + p] = c3 + scale * (ref[p] - h3[p])
         for e in range(0, k, BLOCK):
-            earlier = U[e * _STRIDE : (e + BLOCK) * _STRIDE]
+            earlier = U[e * STRIDE : (e + BLOCK) * STRIDE]
             _subtract_block(block, earlier, L[k : k + BLOCK], e, pixels)
         _solve_block(block, L[k : k + BLOCK, k : k + BLOCK], pixels)
         f0, f1, f2, f3 = (np.float32(y[k]), np.float32(y[k + 1]), np.float32(y[k + 2]), np.float32(y[k + 3]))
         for p in range(pixels):
-            r0, r1 = block[p], block[_STRIDE + p]
-            r2, r3 = block[2 * _STRIDE + p], block[3 * _STRIDE + p]
+            r0, r1 = block[p], block[STRIDE + p]
+            r2, r3 = block[2 * STRIDE + p], block[3 * STRIDE + p]
             estimate[p] += f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3
             variance[p] -= r0 * r0 + r1 * r1 + r2 * r2 + r3 * r3
-        if by_sums:
-            for axis in range(2):
-                _add_rows(block, along[axis, k : k + BLOCK], places[axis], pixels)
-            continue
         for p in range(pixels):
-            c = block[p] * block[p + 1] + block[_STRIDE + p] * block[_STRIDE + p + 1]
-            c += block[2 * _STRIDE + p] * block[2 * _STRIDE + p + 1]
-            right[p] -= c + block[3 * _STRIDE + p] * block[3 * _STRIDE + p + 1]
+            c = block[p] * block[p + 1] + block[STRIDE + p] * block[STRIDE + p + 1]
+            c += block[2 * STRIDE + p] * block[2 * STRIDE + p + 1]
+            right[p] -= c + block[3 * STRIDE + p] * block[3 * STRIDE + p + 1]
         under = block[stride:]
         for p in range(pixels):
-            c = block[p] * under[p] + block[_STRIDE + p] * under[_STRIDE + p]
-            c += block[2 * _STRIDE + p] * under[2 * _STRIDE + p]
-            below[p] -= c + block[3 * _STRIDE + p] * under[3 * _STRIDE + p]
+            c = block[p] * under[p] + block[STRIDE + p] * under[STRIDE + p]
+            c += block[2 * STRIDE + p] * under[2 * STRIDE + p]
+            below[p] -= c + block[3 * STRIDE + p] * under[3 * STRIDE + p]
 
     _settle(samples, count, box, frame_shape, scratch)
-    if by_sums:
-        _improve_by_sums(samples, scale, nugget, box, scratch)
-    else:
-        _improve(box, scratch)
+    _improve(box, scratch)
     for i in range(count):
         row, column = v[i] - box.v0 + 1, u[i] - box.u0 + 1
         if 0 <= row < box.height + 2 and 0 <= column < stride:
@@ -293,25 +257,6 @@ def krige_window(  # type: ignore[no-untyped-def]
             estimate[p] = z[i]
             variance[p] = np.float32(0.0)
             improvement[p] = np.float32(0.0)
-
-
-@njit(cache=True, forceinline=True, nogil=True, error_model="numpy")
-def _whiten(values, count, L, out):  # type: ignore[no-untyped-def]
-    """L^-1 of the differences of `count` values to the first one before them."""
-    for i in range(count):
-        residual = np.float64(values[i + 1] - values[0])
-        for k in range(i):
-            residual -= L[i, k] * out[k]
-        out[i] = residual * L[i, i]
-
-
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _add_rows(block, factors, total, pixels):  # type: ignore[no-untyped-def]
-    """Add the rows of a block of U, each by its factor."""
-    f0, f1 = np.float32(factors[0]), np.float32(factors[1])
-    f2, f3 = np.float32(factors[2]), np.float32(factors[3])
-    for p in range(pixels):
-        total[p] += f0 * block[p] + f1 * block[_STRIDE + p] + f2 * block[2 * _STRIDE + p] + f3 * block[3 * _STRIDE + p]
 
 
 @njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -368,28 +313,3 @@ def _improve(box, scratch):  # type: ignore[no-untyped-def]
     for p in range(size):
         around = to_above[p] * to_above[p] * above[p] + to_below[p] * to_below[p] * under[p]
         result[p] += around / max(kept[p], tiny)
-
-
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _improve_by_sums(samples, a, b, box, scratch):  # type: ignore[no-untyped-def]
-    """Eq. (27), its misprint mended, from sums of 1 / z over the neighbourhood of each pixel."""
-    variance, improvement, inverse = scratch[1], scratch[2], scratch[3]
-    columns, rows = scratch[9][0], scratch[9][1]
-    stride = box.width + 2
-    u_ref, v_ref = samples[0][0], samples[1][0]
-    for row in range(1, box.height + 1):
-        down = np.float32(box.v0 - 1 + row - v_ref)
-        first = row * stride
-        for column in range(1, box.width + 1):
-            p = first + column
-            d_u = np.float32(box.u0 - 1 + column - u_ref) - columns[p]
-            d_v = down - rows[p]
-            left, right = inverse[p - 1], inverse[p + 1]
-            above, under = inverse[p - stride], inverse[p + stride]
-            beyond = variance[p] - b
-            total = left + right + above + under + inverse[p]  # sum of 1 / z(j)
-            first_moments = d_u * (right - left) + d_v * (under - above)
-            second_moments = d_u * d_u * (right + left) + d_v * d_v * (under + above)
-            bracket = beyond * beyond * total + np.float32(4) * a * (beyond * first_moments + a * second_moments)
-            own = (np.float32(2) * b * variance[p] - b * b) * inverse[p]
-            improvement[p] = (bracket + own) / max(variance[p], np.float32(1e-30))

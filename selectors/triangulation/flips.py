@@ -23,7 +23,7 @@ NEXT = np.array([1, 2, 0, 1], np.int64)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def orient(uv: Ints, a: int, b: int, c: int) -> int:
+def orient(uv: Ints, a: int, b: int, c: Whole) -> int:
     """Twice the signed area of the triangle a, b, c: positive if c is on the left of ab."""
     au, av = np.int64(uv[a, 0]), np.int64(uv[a, 1])
     return int((uv[b, 0] - au) * (uv[c, 1] - av) - (uv[c, 0] - au) * (uv[b, 1] - av))
@@ -38,7 +38,7 @@ def height(u: Any, v: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def in_disk(uv: Ints, a: int, b: int, c: int, p: int) -> bool:
+def in_disk(uv: Ints, a: int, b: int, c: int, p: Whole) -> bool:
     """Is p inside the circle through a, b, c (one of which may be the ghost)?
 
     Of four points on one circle, as the corners of every lattice cell, the `height` decides. So
@@ -162,7 +162,7 @@ def settle(uv: Ints, tri: Ints, adj: Ints, count: int, sure: Bools) -> None:
             waits[t] = False
             k = 0
             while k < 3:
-                o, p = adj[t, k], int(tri[t, k])
+                o, p = adj[t, k], np.int64(tri[t, k])
                 # An edge is looked at when the later of its triangles comes. Hull edges stay.
                 if p == GHOST or o > newest or t > newest or (sure[o] and sure[t]):
                     k += 1

@@ -31,7 +31,7 @@ def _is_ear(uv: Ints, ring: Ints, size: int, i: int) -> bool:
     if a != GHOST and b != GHOST and c != GHOST and orient(uv, a, b, c) <= 0:
         return False
     for j in range(size):
-        if j != before and j != i and j != after and ring[j] != GHOST and in_disk(uv, a, b, c, ring[j]):
+        if j != before and j != i and j != after and ring[j] != GHOST and in_disk(uv, a, b, c, np.int64(ring[j])):
             return False
     return True
 

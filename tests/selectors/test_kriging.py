@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from reference_kriging import direct_improvement, gamma, krige
 
 from selective_depth.selectors.improvement.lattice_tables import build_tables
+from selective_depth.selectors.improvement.sums import MOMENTS_NUGGET, improve_by_sums
 from selective_depth.selectors.improvement.systems import (
     MAX_SAMPLES,
-    MOMENTS_NUGGET,
     Box,
     krige_window,
     padded_pixels,
@@ -40,7 +40,9 @@ def window(uv, depth, a, b, w, u0, v0, width, height, by_sums=False):
         distances[n, : line.size] = line
     scratch = window_scratch(room)
     box = Box(u0, v0, width, height)
-    krige_window(samples, count, a, b, between, distances, 0, box, FRAME, scratch, by_sums)
+    krige_window(samples, count, a, b, between, distances, 0, box, FRAME, scratch)
+    if by_sums:
+        improve_by_sums(samples, count, a, b, box, scratch)
     size = (height + 2) * (width + 2)
     return [scratch[q][:size].reshape(height + 2, width + 2)[1:-1, 1:-1].astype(float) for q in range(3)]
 
