@@ -88,7 +88,7 @@ def choose(score: npt.ArrayLike, shots: int, *, crowded: float = CROWDED) -> Int
     Raises
     ------
     ValueError
-        If the score is no image of numbers or `shots` is negative.
+        If the score is not an image of numbers or `shots` is negative.
 
     Examples
     --------

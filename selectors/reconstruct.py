@@ -2,7 +2,7 @@
 
 The reconstruction is the same for every strategy that is compared, so that only the choice of
 the samples differs: linear on the Delaunay triangles of the samples that returned depth, but no
-triangle may bridge a hole or a depth step. A triangle does so if its vertices span more than
+triangle may bridge a hole or a discontinuity. A triangle does so if its vertices span more than
 `STEP_MM` and one of its edges is longer than `BRIDGE_PX`; its pixels, and those outside the
 convex hull, take the depth of their nearest sample.
 """
@@ -19,14 +19,14 @@ from selective_depth.selectors.triangulation import Surface
 def reconstruct(
     uv: npt.ArrayLike, depth_mm: npt.ArrayLike, shape: tuple[int, int], *, threads: int | None = None
 ) -> Floats:
-    """Dense depth from samples: linear on Delaunay triangles, without bridging depth steps.
+    """Dense depth from samples: linear on Delaunay triangles, without bridging discontinuities.
 
     Parameters
     ----------
     uv : int array of shape (n, 2)
         Pixels of the samples, column first. Where one is given twice, the last counts.
     depth_mm : array of shape (n,)
-        Their depth in millimetres; what is no depth (see `measured_mm`) is left out.
+        Their depth in millimetres; what is not a depth (see `measured_mm`) is left out.
     shape : tuple of int
         Height and width of the image in pixels.
     threads : int, optional

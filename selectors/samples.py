@@ -33,7 +33,7 @@ def _record(uv: Ints, depth_mm: Floats, image_mm: Floats, bits: npt.NDArray[np.u
 
 
 def seed_pitch_px(seeds: SeedGrid) -> float:
-    """Widest step of a seed lattice in pixels."""
+    """Pitch of a seed lattice in pixels: along rows or columns, the wider."""
     return max(n / cells for n, cells in zip(seeds.frame_shape, seeds.shape, strict=True))
 
 
@@ -45,8 +45,8 @@ class Samples:
     frame_shape : tuple of int
         Height and width of the frame in pixels.
     pitch_px : float, default 5
-        Widest step of the seed lattice, the scale of all distances: 5 for 128x128 seeds on
-        640x480.
+        Pitch of the seed lattice, the wider of the two and the scale of all distances: 5 for
+        128x128 seeds on 640x480.
     seeds : SeedGrid, optional
         The lattice that all began with, for the selectors that think in its cells and for metric
         points; by default one of that pitch on which nothing was measured, of a Kinect.
@@ -54,10 +54,10 @@ class Samples:
     Attributes
     ----------
     reach_px : float
-        1.3 steps: no shot farther than this from a sample that returned depth, for it would
+        1.3 pitches: no shot farther than this from a sample that returned depth, for it would
         mostly hit a hole (6.5 pixels for 128x128 seeds).
     vote_px : int
-        1.8 steps, at most 21: samples farther than this from a pixel have no say about it. (So
+        1.8 pitches, at most 21: samples farther than this from a pixel have no say about it. (So
         much, on both sides, fits in one word of `bits`.)
     image_mm : float32 array of shape (H, W)
         Depth where a measurement returned, `MISSED` where one did not, 0 where none was made.
@@ -85,7 +85,7 @@ class Samples:
     def of(cls, seeds: SeedGrid | Samples, pitch_px: float | None = None) -> Samples:
         """The seeds of a frame as its first samples, or samples as they are.
 
-        The scale is the seeds' own step by default.
+        The scale is the seeds' own pitch by default.
         """
         if isinstance(seeds, Samples):
             return seeds
@@ -101,7 +101,7 @@ class Samples:
         uv : int array of shape (n, 2)
             Pixels, column first. Of several at one pixel the last counts.
         depth_mm : array of shape (n,)
-            Depth in millimetres; what is no depth (see `measured_mm`) was a shot that returned
+            Depth in millimetres; what is not a depth (see `measured_mm`) was a shot that returned
             nothing.
 
         Raises
@@ -133,7 +133,7 @@ class Samples:
 
     @property
     def camera(self) -> Camera | None:
-        """Intrinsics; None for a sensor that is no pinhole."""
+        """Intrinsics; None for a sensor that is not a pinhole camera."""
         return self.seeds.camera
 
     @property

@@ -43,7 +43,7 @@ class SeedGrid:
     frame_shape : tuple of int
         Height and width of the frame in pixels.
     camera : Camera or None
-        Intrinsics; None for a sensor that is no pinhole, whose metric points are then given.
+        Intrinsics; None for a sensor that is not a pinhole camera, whose metric points are then given.
     given_points_mm : float32 array of shape (R, C, 3), optional
         Metric points of a sensor without pinhole camera (x right, y down, z forward).
     """
@@ -82,13 +82,13 @@ class SeedGrid:
         Parameters
         ----------
         depth_mm : array of shape (height, width)
-            Depth or range in millimetres; what is no depth (see `measured_mm`) is no measurement.
+            Depth or range in millimetres; what is not a depth (see `measured_mm`) was not measured.
         shape : tuple of int, default (128, 128)
             Rows and columns of the lattice.
         camera : Camera, optional
             Intrinsics of a pinhole sensor.
         points_mm : array of shape (height, width, 3), optional
-            Metric points of a sensor that is no pinhole (a LiDAR, a laser scanner). With
+            Metric points of a sensor that is not a pinhole camera (a LiDAR, a laser scanner). With
             neither, a pinhole with a Kinect's field of view is assumed.
 
         Raises

@@ -119,7 +119,7 @@ def _fits_16_bits(depth_mm: Floats) -> bool:
 def best_selector(rounds: int, threads: int | None = None) -> Selector:
     """The selector that `acquire` takes by default: the best there is for so many rounds.
 
-    In one round there is no model yet that knows where the steps are, only the seeds': there the
+    In one round there is no model yet that knows where the discontinuities are, only the seeds': there the
     step score is better, which weighs more samples than a triangle has.
     """
     return StepSelector(threads=threads) if rounds == 1 else SurfaceSelector(threads=threads)
@@ -140,8 +140,8 @@ def acquire(
     Parameters
     ----------
     measure : callable
-        The sensor: pixels (n, 2), column first, to depth (n,) in millimetres; what is no depth
-        (see `measured_mm`) or masked is no return. Asked for the chosen pixels only, each once.
+        The sensor: pixels (n, 2), column first, to depth (n,) in millimetres; what is not a depth
+        (see `measured_mm`) or masked counts as no return. Asked for the chosen pixels only, each once.
     seeds : SeedGrid
         The first measurements; they are not part of the budget.
     budget : float, default 0.05
@@ -169,7 +169,7 @@ def acquire(
         If an argument is out of its range, the sensor does not answer with one depth per pixel, in
         millimetres as the seeds, or a selector's plan asks for a pixel twice or for too many.
     TypeError
-        If `selector` is none.
+        If `selector` is not one.
     """
     if not 1 <= rounds <= MOST_ROUNDS:
         raise ValueError(f"{rounds} rounds were asked for; give between 1 and {MOST_ROUNDS}")

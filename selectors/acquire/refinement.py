@@ -14,7 +14,7 @@ from selective_depth.selectors.samples import seed_pitch_px
 from selective_depth.selectors.seeds import SeedGrid
 
 COARSE_PX = 6.0
-"""Only a lattice with wider steps is refined.
+"""Only a lattice of a wider pitch is refined.
 
 128x128 seeds on 640x480 stand 5 pixels apart, and refining them lowered the oracle share on the
 tuning frames by 1 %, even where it took but a quarter of the budget; 64x64 seeds, 10 pixels apart,
@@ -24,19 +24,19 @@ SHARE = 1 / 3
 """Most of the budget that it may take: at .33 it still gained, at .42 it lost 1 %."""
 
 
-HOLE_STEPS = 3.0
-"""Farther than so many steps from every seed that returned depth, the inside of a hole begins, and
+HOLE_PITCHES = 3.0
+"""Farther than so many pitches from every seed that returned depth, the inside of a hole begins, and
 the lattice ends. Nearer, things can stand that no seed met, and no score goes there (`REACH`).
 
 Not from the tuning frames, which are indifferent (64x64 seeds, +5 %: oracle share 95.7 % at 1.3
-steps, 95.6 % at 2 and 3, 95.1 % without an end), but from a frame of `sequence`, where the lattice
-missed a thing of 32x5 pixels at 1.3 steps."""
+pitches, 95.6 % at 2 and 3, 95.1 % without an end), but from a frame of `sequence`, where the lattice
+missed a thing of 32x5 pixels at 1.3 pitches."""
 
 
 def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[Ints, float]:
     """Pixels between the seeds that make their lattice finer, if it is coarse and they are few.
 
-    Each step adds the middles of the squares of neighbours, which shortens the pitch by sqrt(2):
+    Each time the middles of the squares of neighbours are added, which shortens the pitch by sqrt(2):
     first the middles of the cells, then those of their sides.
 
     Parameters
@@ -49,14 +49,14 @@ def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[Ints, float]:
     Returns
     -------
     uv : int32 array of shape (n, 2)
-        Pixels to measure, column first, none of them a seed and none more than `HOLE_STEPS` from
+        Pixels to measure, column first, none of them a seed and none more than `HOLE_PITCHES` from
         all seeds that returned depth; often empty.
     pitch_px : float
-        Widest step of the lattice with them.
+        Pitch of the lattice with them, the wider of the two.
     """
     rows, columns = seeds.rows.astype(np.int64), seeds.columns.astype(np.int64)
     pitch_px = seed_pitch_px(seeds)
-    reach_px = HOLE_STEPS * pitch_px
+    reach_px = HOLE_PITCHES * pitch_px
     added: list[Longs] = []
     spent = 0
     centred = False  # whether the middles of the cells are in

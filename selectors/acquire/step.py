@@ -1,9 +1,9 @@
 """Where the model is likely to be wrong: the project's own score of unmeasured pixels.
 
-Almost all of the error of a sparse depth model sits at depth steps, between a sample on one
+Almost all of the error of a sparse depth model sits at depth discontinuities, between a sample on one
 surface and a sample on the other. A pixel there belongs to either, and nobody knows to which:
 its expected squared error is the spread of the depths around it, weighted by how near they are.
-A shot halves the stretch in which the step can lie, so the spread counts the more the farther
+A shot halves the stretch in which the discontinuity can lie, so the spread counts the more the farther
 the nearest samples are. Shots that returned nothing mark holes: the chance of a return is the
 share of the neighbours that did.
 """
@@ -29,7 +29,7 @@ class StepSelector:
 
     ``sqrt(P(return)) * (sum_k w_k (z_k - mean)^2 / sum_k w_k + noise^2) * gap`` over the nearest
     samples that returned depth. ``w = 1 / (distance^falloff + 1)``; `mean` is their weighted
-    mean; `gap` is the mean distance of the two nearest, at most so many steps; ``P(return)`` is the
+    mean; `gap` is the mean distance of the two nearest, at most so many pitches of the lattice; ``P(return)`` is the
     share of their weight in that of all shots as near, and its root because even a shot that
     misses tells where the hole ends. Chosen on the `livingroom` and `tabletop` frames; figures
     in ``app/docs/evaluation.md``.
@@ -39,10 +39,10 @@ class StepSelector:
     voters : int, default 5
         How many samples vote, 2 to 6.
     falloff : float, default 4
-        How fast a vote fades with distance: the slower, the wider the band about a strong step
-        that is shot all over before a weaker one is looked at.
+        How fast a vote fades with distance: the slower, the wider the band about a deep
+        discontinuity that is shot all over before a weaker one is looked at.
     gap : float, default 0.8
-        Distance, in steps of the seed lattice, beyond which being farther from the samples
+        Distance, in pitches of the seed lattice, beyond which being farther from the samples
         counts no more (4 pixels for 128x128 seeds on 640x480).
     noise_mm : float, default 1
         Error expected even where all neighbours agree; it spends what is left of a budget on

@@ -1,6 +1,6 @@
 """Where the kept model is likely to be wrong: the default score of unmeasured pixels.
 
-A model that is linear between samples errs where a depth step runs through a triangle, and how much
+A model that is linear between samples errs where a discontinuity runs through a triangle, and how much
 can be read off the model itself: its slope times the distance to the nearest sample is how far the
 depth goes from there to the pixel, and the spread of the corners of the pixel's triangle is what
 there is to go. A shot beside one that missed is likely to miss. Their product is the score. It

@@ -151,7 +151,7 @@ def blend_across(columns, places, mixed, held, estimate, variance, raw):  # type
 def doubtful_cells(padded: Floats, windows: Windows) -> Bytes:
     """Cells between lattice points that are not known as a whole: 1, or 2 where nothing is near.
 
-    A seed that returned depth makes known what lies within reach of it; seeds two lattice steps
+    A seed that returned depth makes known what lies within reach of it; seeds two pitches
     away or farther are not asked. Shape (R + 1, C + 1), with the cells at the frame's edge.
     """
     measured = (padded > 0).astype(np.uint8)

@@ -1,6 +1,6 @@
 """The improvement map of samples anywhere, and only where it is asked for.
 
-After a round of acquisition the samples are no lattice any more. The windows stay as they are
+After a round of acquisition the samples no longer form a lattice. The windows stay as they are
 (see `neighbourhoods`): each now holds all the samples in its box, the nearest to its centre first. On
 a lattice alone that is the same system as `ImprovementSelector` solves.
 """
@@ -66,7 +66,7 @@ def improvement_scattered(
     uv : int array of shape (n, 2)
         Pixels of the samples, column first. Of several at one pixel the last counts.
     depth_mm : array of shape (n,)
-        Their depths in millimetres; what is no depth (see `measured_mm`) is no measurement.
+        Their depths in millimetres; what is not a depth (see `measured_mm`) was not measured.
     shape : tuple of int
         Height and width of the frame.
     where : bool array of shape `shape`, optional

@@ -17,7 +17,7 @@ with once the samples are known. So eq. (23) reads
 zero at every sample and for every j that is one, free of inverses, and good in 32 bits.
 
 The neighbourhood m of a pixel is itself and its four neighbours inside the image. An estimate
-below half the least depth around (an overshoot beside a very deep step) is raised to that, so
+below half the least depth around (an overshoot beside a very deep discontinuity) is raised to that, so
 that eq. (11) never divides by nothing.
 """
 
@@ -187,7 +187,7 @@ def krige_window(  # type: ignore[no-untyped-def]
         The window's pixels; results and distances are laid out with a rim of one pixel on
         every side, row by row, `box.width` + 2 to a row.
     frame_shape : tuple of int
-        Pixels outside the frame are no neighbours.
+        Pixels outside the frame are not neighbours.
     scratch : tuple
         `window_scratch`.
     """

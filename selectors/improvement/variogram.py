@@ -10,7 +10,7 @@ samples of one kriging system, all pairs with the same weight, subject to a >= 0
 - constant depth gives a = b = 0: nothing varies, nothing can improve.
 
 Equal weights are a choice; the paper gives none. Weights that favour short distances (h^-2,
-h^-4) moved the best tenth of the map off the depth steps, see `app/docs/improvement.md`.
+h^-4) moved the best tenth of the map off the depth discontinuities, see `app/docs/improvement.md`.
 """
 
 from __future__ import annotations

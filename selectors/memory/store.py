@@ -1,6 +1,6 @@
 """What was observed at every pixel, over time, and what it comes to.
 
-A depth sensor at a depth step flickers between two surfaces, so the observations of a pixel are no
+A depth sensor at a discontinuity flickers between two surfaces, so the observations of a pixel are no
 Gaussian: they are fused as the mean of those that agree with their median, and those that do not
 are counted, with their distance. A pixel's last `KEPT` observations are kept; medians of nine are
 not enough for its edges (RMSE 37 mm where 31 of them give 33, still camera, workstation).

@@ -4,7 +4,7 @@ A known pixel's error has two parts. It may be fused to the wrong one of two sur
 `n` observations dissenting, the chance that the minority is right is the tail beyond one half of a
 beta distribution, and the error then is their distance. And it has the sensor's noise, which falls
 with the number of observations, and which its neighbourhood shares, for the model is drawn through
-it. A new pixel's error is the range of the model about it, where a step may run.
+it. A new pixel's error is the range of the model about it, where a discontinuity may run.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PRIOR = 0.5
 """Of the beta distribution: as if half an observation had been made of either surface."""
 
 NEW_STEP = 0.125
-"""Chance that a new pixel in the range of a step shows what its neighbours do not."""
+"""Chance that a new pixel in the range of a discontinuity shows what its neighbours do not."""
 NEW_FLAT, SHARED = 0.25, 8.0
 """Weight of the noise of a new pixel, and of a known one, which some eight pixels share: on a
 surface it is better to know few pixels well than many badly."""

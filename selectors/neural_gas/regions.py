@@ -47,7 +47,7 @@ class RegionSelection(Selection):
         ``"3d"`` or ``"image"``.
     complement : bool array of shape (height, width)
         The long-edge complement: pixels of triangles that do not survive. The project's own
-        read-out, not the paper's; with 3-D edges it holds the depth steps.
+        read-out, not the paper's; with 3-D edges it holds the depth discontinuities.
     quantisation_error_mm : float
         Mean distance of the samples to the node that serves each; NaN without samples. After
         `exact` training that is the nearest node of all, after batch training the nearest of

@@ -15,7 +15,7 @@ from selective_depth.selectors.arrays import Bools, Bytes, Floats, Ints
 from selective_depth.selectors.triangulation.flips import GHOST, NEXT, Whole
 
 STEP_MM = 50.0
-"""Depth span of a triangle's vertices above which it may bridge a hole or a step, millimetres."""
+"""Depth span of a triangle's vertices above which it may bridge a hole or a discontinuity, millimetres."""
 
 BRIDGE_PX = 10.0
 """Edge length above which such a triangle does, pixels."""
@@ -25,7 +25,7 @@ TILE_PX = 1 << _SHIFT
 """Side of the square tiles in which changes are booked."""
 
 _PLAIN, _BRIDGE, _OUTSIDE = 0, 1, 2
-"""Kinds of triangles: linear, spanning a hole or a step, outside of the hull."""
+"""Kinds of triangles: linear, spanning a hole or a discontinuity, outside of the hull."""
 
 _SURE = 1e-6
 
@@ -87,7 +87,7 @@ def _after(uv: Ints, a: int, b: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def _bridges(uv: Ints, z_mm: Floats, a: int, b: int, c: int) -> bool:
-    """Whether a triangle of three points spans a hole or a depth step."""
+    """Whether a triangle of three points spans a hole or a depth discontinuity."""
     if max(z_mm[a], z_mm[b], z_mm[c]) - min(z_mm[a], z_mm[b], z_mm[c]) <= STEP_MM:
         return False
     longest = max(

@@ -1,4 +1,4 @@
-"""The steps of a Delaunay triangulation of pixels: where a point lies, and turning an edge.
+"""What a Delaunay triangulation is made by of pixels: where a point lies, and turning an edge.
 
 Pixels have integer coordinates, so the two predicates (on which side of a line, inside which
 circle) are computed in 64-bit integers and are never wrong: no tolerance, no degenerate input.

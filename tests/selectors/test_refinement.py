@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from selective_depth.selectors.acquire import StepSelector, acquire
-from selective_depth.selectors.acquire.refinement import COARSE_PX, HOLE_STEPS, SHARE, finer_lattice
+from selective_depth.selectors.acquire.refinement import COARSE_PX, HOLE_PITCHES, SHARE, finer_lattice
 from selective_depth.selectors.samples import Samples, seed_pitch_px
 from selective_depth.selectors.seeds import SeedGrid
 from selective_depth.selectors.selection import Plan, plan_of
@@ -37,7 +37,7 @@ def test_new_pixels_are_no_seeds_not_deep_in_holes_and_within_the_budget(
         assert uv[:, 0].max() < 160
         assert uv[:, 1].max() < 120
         apart = np.hypot(*(uv[:, None] - seeds.uv[None]).transpose(2, 0, 1)).min(axis=1)
-        assert apart.max() <= HOLE_STEPS * seed_pitch_px(seeds)
+        assert apart.max() <= HOLE_PITCHES * seed_pitch_px(seeds)
 
 
 @pytest.mark.parametrize(("shots", "steps"), [(100, 0), (600, 1), (2000, 2)])
