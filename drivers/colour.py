@@ -136,7 +136,7 @@ class Colouring:
             return cls(intrinsics=numbers[:4], place_mm=numbers[4:])
         return cls(numbers != "off", {"registered": True, "unregistered": False}.get(numbers))
 
-    def told_by(self, intrinsics: tuple[float, ...] | None, place_mm: tuple[float, ...] | None) -> Colouring:
+    def told_by(self, intrinsics: tuple[float, ...] | None, place_mm: tuple[float, ...] | None = None) -> Colouring:
         """The same, completed by what a source knows of its cameras."""
         return replace(self, intrinsics=self.intrinsics or intrinsics, place_mm=self.place_mm or place_mm)
 

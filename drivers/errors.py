@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 
 class SourceError(Exception):
     """Something is wrong with a depth source; the message says what, where and what next."""
@@ -37,3 +39,9 @@ class OutputError(SourceError):
 
 class SourceEndedError(SourceError):
     """Every frame of a recording has been delivered. The normal end, not a fault."""
+
+
+def unwritten(path: Path, error: Exception) -> OutputError:
+    """The error of a recording that cannot be written: why, and what to look at."""
+    why = getattr(error, "strerror", None) or str(error)
+    return OutputError(f"'{path}' cannot be written ({why}); check the folder, its permissions and the free space.")

@@ -99,6 +99,11 @@ class Camera:
         focal = 585.0 * width / 640.0
         return cls(width, height, focal, focal, width / 2, height / 2)
 
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """Focal lengths and principal point: fx, fy, cx, cy."""
+        return self.fx, self.fy, self.cx, self.cy
+
     def points_mm(self, uv: npt.NDArray[np.generic], depth_mm: npt.NDArray[np.generic]) -> npt.NDArray[np.float32]:
         """Metric points of pixels: x right, y down, z forward, in millimetres.
 

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from selective_depth.drivers.bag.optional import rosbags
-from selective_depth.drivers.errors import OutputError
+from selective_depth.drivers.errors import OutputError, unwritten
 from selective_depth.drivers.frame import Camera, DepthFrame
 
 TOPIC = "/camera/depth/image_rect_raw"
@@ -51,7 +51,7 @@ class BagWriter:
             self._writer: Any = library.Writer(self._unborn, version=8, storage_plugin=kind)
             self._writer.open()
         except (OSError, library.WriterError) as error:
-            raise self._failed(error) from error
+            raise unwritten(self.path, error) from error
         self._topics: dict[str, Any] = {}
         self._count = 0
 
@@ -104,7 +104,7 @@ class BagWriter:
                 inner = next(self._unborn.glob("*.mcap")) if self._mcap else self._unborn
                 inner.replace(self.path)
         except OSError as error:
-            raise self._failed(error) from error
+            raise unwritten(self.path, error) from error
         finally:
             shutil.rmtree(self._unborn, ignore_errors=True)
 
@@ -124,7 +124,7 @@ class BagWriter:
         try:
             self._writer.write(connection, timestamp_us * 1000, data)
         except OSError as error:
-            raise self._failed(error) from error
+            raise unwritten(self.path, error) from error
 
     def _info(self, header: Any, camera: Camera) -> Any:
         types = self._store.types
@@ -135,9 +135,3 @@ class BagWriter:
             r=np.eye(3).reshape(-1), p=p, binning_x=0, binning_y=0,
             roi=types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False),
         )  # fmt: skip
-
-    def _failed(self, error: Exception) -> OutputError:
-        why = getattr(error, "strerror", None) or str(error)
-        return OutputError(
-            f"'{self.path}' cannot be written ({why}); check the folder, its permissions and the free space."
-        )

@@ -5,7 +5,7 @@ from selective_depth.drivers.oni.reader import OniReader
 from selective_depth.drivers.oni.recorder import OniRecorder, check_place
 from selective_depth.drivers.oni.repair import export_oni, repair_oni
 from selective_depth.drivers.oni.report import OniReport
-from selective_depth.drivers.oni.writer import OniWriter, write_oni
+from selective_depth.drivers.oni.writer import OniWriter
 
 __all__ = [
     "OniReader",
@@ -16,5 +16,4 @@ __all__ = [
     "export_oni",
     "inspect_oni",
     "repair_oni",
-    "write_oni",
 ]

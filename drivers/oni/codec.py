@@ -45,7 +45,7 @@ def decode_depth(codec: bytes, payload: bytes, height: int, width: int) -> _Dept
     Parameters
     ----------
     codec : bytes
-        One of `oni_records.DEPTH_CODECS`.
+        One of `records.DEPTH_CODECS`.
     payload : bytes
         The compressed frame.
     height, width : int
@@ -75,19 +75,23 @@ def decode_depth(codec: bytes, payload: bytes, height: int, width: int) -> _Dept
     return depth.reshape(height, width) if _decode(coded, table, depth) else None
 
 
-def encode_depth(depth_mm: _Depth) -> bytes:
-    """Compress one frame as ``16zT``.
+def encode_depth(depth_mm: _Depth, codec: bytes = CODEC_TABLE) -> bytes:
+    """Encode one frame.
 
     Parameters
     ----------
     depth_mm : uint16 array of shape (height, width)
         Depth in millimetres.
+    codec : bytes, default ``16zT``
+        That, or ``NONE``.
 
     Raises
     ------
     ValueError
-        If more than `MAX_DISTINCT` different depths occur.
+        If more than `MAX_DISTINCT` different depths occur, which only ``NONE`` can store.
     """
+    if codec == CODEC_NONE:
+        return depth_mm.astype("<u2").tobytes()
     flat = np.ascontiguousarray(depth_mm).reshape(-1)
     occurs = np.zeros(65536, np.bool_)
     occurs[flat] = True

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import BinaryIO, Final
 
 from selective_depth.drivers.colour import Colouring, nearest, rgb_of
 from selective_depth.drivers.frame import Camera, ColourArray, DepthFrame
 from selective_depth.drivers.oni.files import read_payload
+from selective_depth.drivers.oni.nodes import REGISTERED, OniFrame, OniNode
 from selective_depth.drivers.oni.records import NodeType
-from selective_depth.drivers.oni.report import CAMERA, REGISTERED, OniFrame, OniNode
 
 _KINDS: Final = {200: "RGB888", 201: "YUV422", 202: "GRAY8", 205: "YUYV"}
 """OpenNI2's numbers of the pixel formats that colour comes in uncompressed."""
@@ -53,7 +54,8 @@ class OniColour:
                 self.unsupported = f"the colour of {node.name} ({codec}) is of a form that is not read"
                 continue
             self.node, self._kind, self._size = node, kind, (int(mode[0]), int(mode[1]))
-            self.camera = _camera(node, self._size)
+            with suppress(ValueError, ArithmeticError):
+                self.camera = node.camera(*self._size)
         self._times_us = [frame.timestamp_us for frame in self.node.frames] if self.node else []
 
     def read(self, file: BinaryIO, frame: OniFrame) -> ColourArray | None:
@@ -71,13 +73,5 @@ class OniColour:
         colour = self.read(file, self.node.frames[at])
         if colour is None:
             return frame
-        camera = self.camera and (self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy)
-        return colouring.told_by(camera or None, None).colour(frame, colour, self._times_us[at], self.registered)
-
-
-def _camera(node: OniNode, size: tuple[int, int]) -> Camera | None:
-    own, fov_rad = node.values_of(CAMERA, "<dddd"), node.values_of("xnFOV", "<dd")
-    try:
-        return Camera(*size, *own) if own else Camera.from_fov(*size, *fov_rad) if fov_rad else None
-    except ValueError:
-        return None
+        colouring = colouring.told_by(self.camera.intrinsics if self.camera else None)
+        return colouring.colour(frame, colour, self._times_us[at], self.registered)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from selective_depth.drivers.errors import DamagedRecordingError, SourceNotFoundError
-from selective_depth.drivers.oni.report import OniFrame
+from selective_depth.drivers.oni.nodes import OniFrame
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -25,7 +25,7 @@ def open_regular(path: Path) -> BinaryIO:
         if not path.exists():
             raise SourceNotFoundError(f"'{path}' does not exist; check its name.")
         if not path.is_file():
-            what = "a folder" if path.is_dir() else "no regular file"
+            what = "a folder" if path.is_dir() else "not a regular file"
             raise SourceNotFoundError(f"'{path}' is {what}; give a recording, FILE.oni.")
         return path.open("rb", buffering=0)
     except OSError as error:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from itertools import pairwise
 from statistics import median
 from typing import Final
@@ -11,8 +10,9 @@ from typing import Final
 import numpy as np
 
 from selective_depth.drivers.frame import Camera, DepthArray
+from selective_depth.drivers.oni.nodes import CAMERA, OniNode
 from selective_depth.drivers.oni.records import CODEC_TABLE, DEPTH_CODECS, MAX_PAYLOAD, NodeType
-from selective_depth.drivers.oni.report import CAMERA, OniNode
+from selective_depth.drivers.oni.report import OniReport
 
 _MILLIMETRES, _TENTHS = 100, 101
 """OpenNI2's numbers of the pixel formats "depth in 1 mm" and "in 100 um"."""
@@ -20,91 +20,77 @@ _SHIFTS: Final = {102: "9.2", 103: "9.3"}
 _LONGEST_GAP_US: Final = 1 << 40
 _USUAL_STEP_US: Final = 33_333
 
-Problem = Callable[[int, str], None]
 
-
-@dataclass(frozen=True, slots=True)
-class DepthForm:
-    """How payloads of a depth stream become frames.
+def read_form(report: OniReport, depth: OniNode) -> None:
+    """Fill in how payloads of a depth stream become frames, after checking what the player relies on.
 
     Parameters
     ----------
-    camera : Camera or None
-        Its size is that of the frames, cropped as they are; None if that is unknown.
-    fps : float
-        Recorded frame rate.
-    tenths : bool
-        Values are tenths of millimetres.
-    unsupported : str
-        Why it cannot be read although it is in order; empty if it can.
-    notes : tuple of str
-        What is done to the frames.
-    """
-
-    camera: Camera | None = None
-    fps: float = 30.0
-    tenths: bool = False
-    unsupported: str = ""
-    notes: tuple[str, ...] = ()
-
-
-def depth_form(node: OniNode, problem: Problem) -> DepthForm:
-    """The form of a depth stream, after checking what the player relies on.
-
-    Parameters
-    ----------
-    node : OniNode
+    report : OniReport
+        Gets their camera, rate and unit, what is done to them, whatever is wrong, and why they
+        cannot be read.
+    depth : OniNode
         The stream. Properties that are wrong are removed.
-    problem : callable
-        Called with offset and sentence of whatever is wrong.
     """
-    mode = node.values_of("xnMapOutputMode", "<III")
+
+    def problem(sentence: str) -> None:
+        report.problem(depth.offset, sentence)
+
+    mode = depth.values_of("xnMapOutputMode", "<III")
     if mode is None:
-        problem(node.offset, "the frame size is not recorded")
-        return DepthForm()
+        problem("the frame size is not recorded")
+        return
     width, height, fps = (int(value) for value in mode)
     if not (width and height and 2 * width * height <= MAX_PAYLOAD and 1 <= fps <= 1000):
-        problem(node.offset, f"the frames cannot be {width}x{height} at {fps} a second")
-        return DepthForm()
-    if node.codec not in DEPTH_CODECS:
-        return DepthForm(fps=fps)
-    pixels = node.number_of("oniPixelFormat")
+        problem(f"the frames cannot be {width}x{height} at {fps} a second")
+        return
+    report.fps = fps
+    pixels = depth.number_of("oniPixelFormat")
+    if depth.codec not in DEPTH_CODECS:
+        return
     if pixels in _SHIFTS:
-        why = f"its pixels are shifts in {_SHIFTS[pixels]}, which only its sensor turns into depth"
-        return DepthForm(fps=fps, unsupported=why)
+        report.unsupported = f"its pixels are shifts in {_SHIFTS[pixels]}, which only its sensor turns into depth"
+        return
     if pixels not in (None, _MILLIMETRES, _TENTHS):
-        problem(node.offset, f"the pixels have format {pixels}, which is not millimetres")
-        return DepthForm(fps=fps)
-    frame_bytes = node.number_of("oniRequiredFrameSize")
+        problem(f"the pixels have format {pixels}, which is not millimetres")
+        return
+    frame_bytes = depth.number_of("oniRequiredFrameSize")
     if frame_bytes not in (None, 2 * width * height):
-        del node.properties["oniRequiredFrameSize"]
-        problem(node.offset, f"frames of {width}x{height} do not have {frame_bytes} bytes")
-    max_depth = node.number_of("xnDeviceMaxDepth")
-    if node.codec == CODEC_TABLE and not 1 <= (max_depth or 0) < 65536:
-        node.properties.pop("xnDeviceMaxDepth", None)
-        problem(node.offset, f"the largest depth cannot be {max_depth} mm")
+        del depth.properties["oniRequiredFrameSize"]
+        problem(f"frames of {width}x{height} do not have {frame_bytes} bytes")
+    max_depth = depth.number_of("xnDeviceMaxDepth")
+    if depth.codec == CODEC_TABLE and not 1 <= (max_depth or 0) < 65536:
+        depth.properties.pop("xnDeviceMaxDepth", None)
+        problem(f"the largest depth cannot be {max_depth} mm")
     notes = []
-    sides = {frame.mirrored for frame in node.frames}
+    sides = {frame.mirrored for frame in depth.frames}
     if True in sides:
         some = " in part (the side was switched while it recorded)" if len(sides) > 1 else ""
         notes.append(f"it is mirrored{some}; its frames are delivered the right way round")
-    if pixels == _TENTHS:
+    report.tenths = pixels == _TENTHS
+    if report.tenths:
         reach = f" (beyond {max_depth / 10:g} mm its recorder falsifies)" if max_depth else ""
         notes.append(f"its unit is 0.1 mm; its frames are delivered in whole mm{reach}")
-    form = DepthForm(_camera(node, width, height, problem), fps, pixels == _TENTHS)
-    crop = node.values_of("xnCropping", "<IHHHH")
+    try:
+        camera = depth.camera(width, height)
+    except (ValueError, ArithmeticError) as error:
+        depth.properties.pop(CAMERA if CAMERA in depth.properties else "xnFOV", None)
+        problem(f"the field of view is wrong: {error}")
+        camera = None
+    camera = camera or Camera.kinect(width, height)
+    crop = depth.values_of("xnCropping", "<IHHHH")
     if crop is None:
-        problem(node.offset, "the cropping is not recorded: OpenNI2 would deliver no frame at all")
-    elif crop[0] and form.camera is not None:
+        problem("the cropping is not recorded: OpenNI2 would deliver no frame at all")
+    elif crop[0]:
         left, top, across, down = (int(value) for value in crop[1:])
         if not (0 < across <= width - left and 0 < down <= height - top):
-            problem(node.offset, f"{width}x{height} cannot be cropped to {crop[1:]}")
-            return DepthForm(fps=fps)
+            problem(f"{width}x{height} cannot be cropped to {crop[1:]}")
+            return
         notes.append(f"it is cropped to {across}x{down} at {left}, {top}; its camera is shifted")
         left = width - left - across if sides == {True} else left
-        cx, cy = form.camera.cx - left, form.camera.cy - top
-        form = replace(form, camera=replace(form.camera, width=across, height=down, cx=cx, cy=cy))
-    return replace(form, notes=tuple(notes))
+        camera = Camera(across, down, camera.fx, camera.fy, camera.cx - left, camera.cy - top)
+    report.camera = camera
+    report.notes += tuple(notes)
 
 
 def upright(raw: DepthArray, tenths: bool, mirrored: bool) -> DepthArray:
@@ -150,32 +136,13 @@ def turned_at(number: int) -> str:
     return f"turns into its mirror image at frame {number}; its frames are delivered on one side."
 
 
-def no_depth(nodes: list[OniNode]) -> str:
+def no_depth(nodes: Sequence[OniNode]) -> str:
     """Why a file without a depth frame holds none, naming what is there."""
     streams = [f"{node.name} ({len(node.frames)} frames)" for node in nodes if node.is_stream]
     there = f"; it holds {', '.join(streams)}" if streams else ""
     if any(node.node_type == NodeType.DEPTH for node in nodes):
         return f"its depth stream never gave a frame{there}"
     return f"no depth was recorded{there}"
-
-
-def _camera(node: OniNode, width: int, height: int, problem: Problem) -> Camera:
-    own, fov_rad = node.values_of(CAMERA, "<dddd"), node.values_of("xnFOV", "<dd")
-    optics = node.values_of("xnRealWorldTranslationData", "<ddd")
-    try:
-        if own is not None:
-            return Camera(width, height, *own)
-        if fov_rad is None and optics is not None:
-            # OpenNI 1 at first recorded the size of a pixel at a distance instead.
-            distance, pixel_size, pixels_to_depth = optics
-            focal = distance / (pixel_size * pixels_to_depth)
-            return Camera(width, height, focal, focal, width / 2, height / 2)
-        if fov_rad is not None:
-            return Camera.from_fov(width, height, *fov_rad)
-    except (ValueError, ArithmeticError) as error:
-        node.properties.pop(CAMERA if own is not None else "xnFOV", None)
-        problem(node.offset, f"the field of view is wrong: {error}")
-    return Camera.kinect(width, height)
 
 
 def mended_times(times_us: list[int]) -> tuple[list[int], int | None]:

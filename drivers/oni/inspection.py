@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from selective_depth.drivers.errors import SourceNotFoundError
+from selective_depth.drivers.frame import Camera
 from selective_depth.drivers.oni.files import open_regular, read_payload, skip_hole, unreadable
-from selective_depth.drivers.oni.form import DepthForm, Sides, depth_form, mended_times, no_depth, turned_at, upright
+from selective_depth.drivers.oni.form import Sides, mended_times, no_depth, read_form, turned_at, upright
+from selective_depth.drivers.oni.nodes import CAMERA, OniFrame, OniNode
 from selective_depth.drivers.oni.records import (
     BEGIN_FIELDS,
     CODEC_TABLE,
@@ -36,11 +38,11 @@ from selective_depth.drivers.oni.records import (
     NodeType,
     Record,
     RecordError,
-    parse_addition,
     parse_property,
     read_record,
+    unpack_fields,
 )
-from selective_depth.drivers.oni.report import CAMERA, STREAMS, OniFrame, OniNode, OniProblem, OniReport
+from selective_depth.drivers.oni.report import OniReport
 
 _MAX_NODES: Final = 64
 _SIZES: Final = {"xnMapOutputMode": 12, "xnCropping": 12, "xnFOV": 16, "xnRealWorldTranslationData": 24, CAMERA: 32}
@@ -74,131 +76,96 @@ def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10
     path = Path(path)
     with open_regular(path) as file:
         try:
-            return _Inspection(path, file, timeout_s, stream).report(decode)
+            return _Inspection(path, file).report_on(stream, decode, timeout_s)
         except OSError as error:
             raise unreadable(path, error) from error
 
 
 class _Inspection:
-    """One walk over a file."""
+    """One walk over a file, which fills a report."""
 
-    def __init__(self, path: Path, file: BinaryIO, timeout_s: float, stream: int = 1) -> None:
-        self.path = path
-        self.stream = stream
+    def __init__(self, path: Path, file: BinaryIO) -> None:
         self.file = file
         self.size = os.fstat(file.fileno()).st_size
-        self.deadline = time.monotonic() + timeout_s
-        self.problems: list[OniProblem] = []
+        self.report = OniReport(path, self.size)
+        self.problem = self.report.problem
         self.nodes: dict[int, OniNode] = {}
-        self.version = ""
-        self.old = False
         self.latest_us = 0
         self.highest_node = 0
         self.begun = False
-        self.end: int | None = None
         self._block = (0, b"")  # where the search for the next record was last
 
-    def report(self, decode: bool) -> OniReport:
+    def report_on(self, stream: int = 1, decode: bool = False, timeout_s: float = 10.0) -> OniReport:
+        """See `inspect_oni`."""
+        report, deadline_s = self.report, time.monotonic() + timeout_s
         if self._read_header():
             self._walk()
             self._check_counts()
-        nodes = list(self.nodes.values())
+        nodes = report.nodes = tuple(self.nodes.values())
         depths = [node for node in nodes if node.node_type == NodeType.DEPTH]
-        if self.stream > max(1, len(depths)):
+        if stream > max(1, len(depths)):
             raise SourceNotFoundError(
-                f"'{self.path}' has {len(depths)} depth streams; ?stream={self.stream} is not among"
-                " them, the first is 1."
+                f"'{report.path}' has {len(depths)} depth streams; ?stream={stream} is not among them, the first is 1."
             )
-        depth = depths[self.stream - 1] if depths else None
-        form, decoded, swapped, notes = DepthForm(), 0, 0, self._mend_times()
+        depth = report.depth = depths[stream - 1] if depths else None
+        self._mend_times()
         if depth is not None:
-            form = depth_form(depth, self._problem)
-            notes += form.notes
-            if len(depths) > 1:
-                notes += (f"it holds {len(depths)} depth streams; FILE.oni?stream=N is the N-th",)
-        unsupported = form.unsupported
-        if not any(node.is_stream for node in nodes) and self.version:
-            self._problem(0, "the file holds no depth stream")
-        elif self.begun and not (depth and depth.frames) and not self.problems:
-            unsupported = no_depth(nodes)
+            read_form(report, depth)
+        if len(depths) > 1:
+            report.notes += (f"it holds {len(depths)} depth streams; FILE.oni?stream=N is the N-th",)
+        if report.version and not any(node.is_stream for node in nodes):
+            self.problem(0, "the file holds no depth stream")
+        elif self.begun and not report.frames and not report.problems:
+            report.unsupported = no_depth(nodes)
         if depth is not None:
-            if form.camera is None:
+            if report.camera is None:
                 depth.frames.clear()
             elif decode:
-                decoded, swapped, turned = self._decode_frames(depth, form)
-                notes += (*turned, *self._decode_colour())
-        return OniReport(
-            path=self.path,
-            size_bytes=self.size,
-            version=self.version,
-            nodes=tuple(nodes),
-            depth=depth,
-            camera=form.camera,
-            fps=form.fps,
-            tenths=form.tenths,
-            unsupported=unsupported,
-            notes=notes,
-            problems=tuple(sorted(self.problems, key=lambda problem: problem.offset)),
-            ended=self.end is not None,
-            tail_bytes=0 if self.end is None else self.size - self.end,
-            old=self.old,
-            decoded_frames=decoded,
-            swapped_frames=swapped,
-        )
+                self._decode_frames(depth, report.camera, deadline_s)
+                self._decode_colour(deadline_s)
+        return report
 
-    def _mend_times(self) -> tuple[str, ...]:
-        notes = []
+    def _mend_times(self) -> None:
         for node in self.nodes.values():
             times_us, first = mended_times([frame.timestamp_us for frame in node.frames])
             if first is not None:
-                number = node.frames[first].number
-                notes.append(
-                    f"the clock of {node.name} jumps at frame {number}; its times are delivered so"
-                    " that they go on rising, and --repair writes them so"
+                self.report.notes += (
+                    f"the clock of {node.name} jumps at frame {node.frames[first].number}; its times are delivered"
+                    " so that they go on rising, and --repair writes them so",
                 )
                 pairs = zip(node.frames, times_us, strict=True)
-                node.frames[:] = [replace(frame, timestamp_us=time) for frame, time in pairs]
-        return tuple(notes)
-
-    def _problem(self, offset: int, sentence: str, *, harmless: bool = False) -> None:
-        self.problems.append(OniProblem(offset, sentence, harmless))
+                node.frames[:] = [replace(frame, timestamp_us=time_us) for frame, time_us in pairs]
 
     def _read_header(self) -> bool:
-        start = self.file.read(FILE_HEADER.size)
-        if start[:4] != IDENTITY:
-            lfs = start.startswith(b"version https://git-lfs"[: FILE_HEADER.size])
-            self._problem(
-                0,
-                "the file is empty"
-                if not start
-                else "this is a Git LFS pointer and not the recording; `git lfs pull` fetches it"
-                if lfs
-                else f"this is no .oni file: it begins with {start[:4]!r} instead of {IDENTITY!r}",
-            )
-            return False
-        if len(start) < FILE_HEADER.size:
-            self._problem(len(start), "the file ends inside its header")
-            return False
-        _, *version, self.latest_us, self.highest_node = FILE_HEADER.unpack(start)
-        if not OLDEST_VERSION <= tuple(version) <= VERSION:
-            numbers = ".".join(map(str, version))
-            self._problem(4, f"version {numbers} of the format is not known, only up to 1.0.1.0")
-            return False
-        self.version = ".".join(map(str, version))
-        self.old = tuple(version) < VERSION
-        if self.highest_node > _MAX_NODES:
-            self._problem(20, f"the header tells of {self.highest_node} streams")
-        return True
+        start, problem = self.file.read(FILE_HEADER.size), self.problem
+        if not start:
+            problem(0, "the file is empty")
+        elif start.startswith(b"version https://git-lfs"[: FILE_HEADER.size]):
+            problem(0, "this is a Git LFS pointer and not the recording; `git lfs pull` fetches it")
+        elif start[:4] != IDENTITY:
+            problem(0, f"this is not an .oni file: it begins with {start[:4]!r} instead of {IDENTITY!r}")
+        elif len(start) < FILE_HEADER.size:
+            problem(len(start), "the file ends inside its header")
+        else:
+            _, *version, self.latest_us, self.highest_node = FILE_HEADER.unpack(start)
+            number = ".".join(map(str, version))
+            if OLDEST_VERSION <= tuple(version) <= VERSION:
+                self.report.version, self.report.old = number, tuple(version) < VERSION
+                if self.highest_node > _MAX_NODES:
+                    problem(20, f"the header tells of {self.highest_node} streams")
+            else:
+                problem(4, f"version {number} of the format is not known, only up to 1.0.1.0")
+        return bool(self.report.version)
 
     def _walk(self) -> None:
         offset = FILE_HEADER.size
         while offset < self.size:
             try:
-                record = read_record(self.file, offset, self.size, self.old)
+                record = read_record(self.file, offset, self.size, self.report.old)
             except RecordError as error:
                 found = self._next_record(offset + 1)
                 # A recorder that was stopped leaves half a record at the very end.
-                self._problem(offset, f"{error}", harmless=found is None and self._cut(error))
+                self.problem(offset, f"{error}", harmless=found is None and self._cut(error))
                 if found is None:
                     break
                 offset = found
@@ -206,25 +173,25 @@ class _Inspection:
             try:
                 self._handle(record)
             except RecordError as error:
-                self._problem(offset, f"a {record.kind.name} record is wrong: {error}")
+                self.problem(offset, f"a {record.kind.name} record is wrong: {error}")
             offset = record.end
             if record.kind is Kind.END:
-                self.end = offset
+                self.report.end_offset = offset
                 self._walk_beyond_end(offset)
                 return
-        self._problem(self.size, "the file ends without its END mark", harmless=True)
+        self.problem(self.size, "the file ends without its END mark", harmless=True)
 
     def _walk_beyond_end(self, offset: int) -> None:
         """OpenNI 1's recorder writes END before it removes the nodes and adds their tables."""
-        while self.end is not None and offset < self.size:
+        while offset < self.size:
             try:
-                record = read_record(self.file, offset, self.size, self.old)
+                record = read_record(self.file, offset, self.size, self.report.old)
                 if record.kind not in (Kind.NODE_REMOVED, Kind.SEEK_TABLE):
                     return
                 self._handle(record)
             except RecordError:
                 return  # zeros, as a rule; a table that is needed is missed later
-            self.end = offset = record.end
+            self.report.end_offset = offset = record.end
 
     @staticmethod
     def _cut(error: RecordError) -> bool:
@@ -234,7 +201,7 @@ class _Inspection:
         """Offset of the next sound record at or after an offset, None if there is none."""
         for found in self._find_magic(offset):
             try:
-                record = read_record(self.file, found, self.size, self.old)
+                record = read_record(self.file, found, self.size, self.report.old)
             except RecordError:
                 continue
             if record.node in self.nodes or record.kind in (*NODE_ADDITIONS, Kind.END):
@@ -286,22 +253,14 @@ class _Inspection:
             raise RecordError(f"it has {record.payload_size} bytes of payload but needs none")
 
     def _add_node(self, record: Record) -> None:
-        addition = parse_addition(record, self.old)
-        if record.node in self.nodes:
-            raise RecordError(f"node {record.node} was added before")
-        self.nodes[record.node] = OniNode(
-            record.node,
-            addition.name,
-            addition.node_type,
-            addition.codec,
-            addition.frames,
-            addition.seek_table_offset,
-            record.offset,
-        )
-        if record.node > self.highest_node:
-            raise RecordError(f"node {record.node} is beyond the highest that the header states, {self.highest_node}")
-        if addition.node_type in STREAMS and addition.codec not in CODECS:
-            raise RecordError(f"the compression {addition.codec!r} is not known")
+        node = OniNode.added(record, self.report.old)
+        if node.number in self.nodes:
+            raise RecordError(f"node {node.number} was added before")
+        self.nodes[node.number] = node
+        if node.number > self.highest_node:
+            raise RecordError(f"node {node.number} is beyond the highest that the header states, {self.highest_node}")
+        if node.is_stream and node.codec not in CODECS:
+            raise RecordError(f"the compression {node.codec!r} is not known")
 
     def _set_property(self, node: OniNode, record: Record) -> None:
         name, value = parse_property(record)
@@ -313,35 +272,31 @@ class _Inspection:
         node.properties[name] = (record.kind, value)
 
     def _begin(self, node: OniNode, record: Record) -> None:
-        if len(record.fields) != BEGIN_FIELDS.size:
-            raise RecordError(f"it has {len(record.fields)} bytes of fields")
+        frames, _ = unpack_fields(record, BEGIN_FIELDS)
         if not node.is_stream:
             raise RecordError(f"node {node.number} delivers no frames")
         self.begun = True
-        frames, _ = BEGIN_FIELDS.unpack(record.fields)
         if node.declared_frames is None and frames != UNKNOWN_COUNT:
             node.declared_frames = frames  # where versions before 1.0.0.5 keep it
 
     def _add_frame(self, node: OniNode, record: Record) -> None:
-        if len(record.fields) != FRAME_FIELDS.size:
-            raise RecordError(f"it has {len(record.fields)} bytes of fields")
+        timestamp_us, number = unpack_fields(record, FRAME_FIELDS)
         if not (node.is_stream and node.ready and self.begun):
             raise RecordError(f"node {node.number} was not ready for frames")
         if node.changed:
             return  # what comes now is of another size or unit
-        timestamp_us, number = FRAME_FIELDS.unpack(record.fields)
         last = node.frames[-1] if node.frames else None
         if number != (last.number if last else 0) + 1:
-            self._problem(record.offset, f"frame {number} follows frame {last.number if last else 0} of {node.name}")
+            self.problem(record.offset, f"frame {number} follows frame {last.number if last else 0} of {node.name}")
             if last is not None and number <= last.number:
                 return
         if timestamp_us > self.latest_us:
-            self._problem(record.offset, f"frame {number} is later than the recording's end")
+            self.problem(record.offset, f"frame {number} is later than the recording's end")
         place = record.offset, record.payload_offset, record.payload_size
         node.frames.append(OniFrame(number, timestamp_us, *place, node.number_of("xnMirror") == 1))
 
     def _check_seek_table(self, node: OniNode, record: Record) -> None:
-        form = OLD_SEEK_ENTRY if self.old else SEEK_ENTRY
+        form = OLD_SEEK_ENTRY if self.report.old else SEEK_ENTRY
         if record.offset != node.seek_table_offset:
             raise RecordError(f"node {node.number} expects it at byte {node.seek_table_offset}")
         if record.payload_size != (len(node.frames) + 1) * form.size:
@@ -353,72 +308,67 @@ class _Inspection:
             raise RecordError("the file became shorter while it was read")
         for frame, entry in zip(node.frames, list(form.iter_unpack(table))[1:], strict=True):
             if (entry[0], entry[2]) != (frame.timestamp_us, frame.record_offset):
-                self._problem(record.offset, f"the seek table and frame {frame.number} disagree on its place or time")
+                self.problem(record.offset, f"the seek table and frame {frame.number} disagree on its place or time")
                 return
 
     def _check_counts(self) -> None:
         if not self.begun:
-            self._problem(self.size, "the recording never began")
+            self.problem(self.size, "the recording never began")
         for node in self.nodes.values():
             if not node.is_stream:
                 continue
             there = len(node.frames)
             if node.declared_frames is None:
-                self._problem(
+                self.problem(
                     node.offset,
                     f"the number of {node.name} frames was never written: the recorder was stopped",
                     harmless=node.seek_table_offset == 0,
                 )
             elif node.declared_frames != there and not node.changed:
-                self._problem(self.size, f"{node.declared_frames} {node.name} frames are announced, {there} are there")
+                self.problem(self.size, f"{node.declared_frames} {node.name} frames are announced, {there} are there")
             if node.seek_table_offset and node.declared_frames and not node.has_seek_table:
-                self._problem(
-                    self.size, f"there is no sound seek table of {node.name} at byte {node.seek_table_offset}"
-                )
+                self.problem(self.size, f"there is no sound seek table of {node.name} at byte {node.seek_table_offset}")
 
-    def _decode_colour(self) -> tuple[str, ...]:
-        """Drop the colour frames that cannot be decoded; a note where none can be read."""
+    def _decode_colour(self, deadline_s: float) -> None:
+        """Drop the colour frames that cannot be decoded; note where none can be read."""
         from selective_depth.drivers.oni.colour import OniColour
 
         colour = OniColour(self.nodes.values())
         if colour.node is None:
-            return (colour.unsupported,) if colour.unsupported else ()
+            self.report.notes += (colour.unsupported,) if colour.unsupported else ()
+            return
         sound = []
         for frame in colour.node.frames:
-            if time.monotonic() < self.deadline and colour.read(self.file, frame) is None:
-                self._problem(frame.record_offset, f"frame {frame.number} of {colour.node.name} cannot be decoded")
+            if time.monotonic() < deadline_s and colour.read(self.file, frame) is None:
+                self.problem(frame.record_offset, f"frame {frame.number} of {colour.node.name} cannot be decoded")
             else:
                 sound.append(frame)
         colour.node.frames[:] = sound
-        return ()
 
-    def _decode_frames(self, node: OniNode, form: DepthForm) -> tuple[int, int, list[str]]:
+    def _decode_frames(self, depth: OniNode, camera: Camera, deadline_s: float) -> None:
         """Drop the frames that cannot be decoded, as far as time allows; mark those turned round.
 
-        Returns how many can, how many of these the recorder swapped the last pixels of, and a note
-        where they turn round.
+        Counts those that can, and of these those that the recorder swapped the last pixels of.
         """
         # Compiled code, whose import takes longer than a whole check without it.
         from selective_depth.drivers.oni.codec import decode_depth, mend_order
 
-        assert form.camera is not None
-        decoded, swapped, sound, sides, notes = 0, 0, [], Sides(), []
-        size = form.camera.height, form.camera.width
-        for frame in node.frames:
-            if time.monotonic() < self.deadline:
+        report, sides, sound = self.report, Sides(), []
+        size = camera.height, camera.width
+        for frame in depth.frames:
+            if time.monotonic() < deadline_s:
                 payload = read_payload(self.file, frame)
-                raw = decode_depth(node.codec, payload, *size)
+                raw = decode_depth(depth.codec, payload, *size)
                 if raw is None:
-                    self._problem(frame.record_offset, f"frame {frame.number} cannot be decoded")
+                    self.problem(frame.record_offset, f"frame {frame.number} cannot be decoded")
                     continue
-                decoded += 1
-                swapped += node.codec == CODEC_TABLE and mend_order(payload, *size) is not None
+                report.decoded_frames += 1
+                report.swapped_frames += depth.codec == CODEC_TABLE and mend_order(payload, *size) is not None
                 turns = sides.turns
-                sides.put_right(upright(raw, form.tenths, frame.mirrored))
+                sides.put_right(upright(raw, report.tenths, frame.mirrored))
                 if sides.turns > turns == 0:
-                    notes.append(f"it {turned_at(frame.number)}")
+                    report.notes += (f"it {turned_at(frame.number)}",)
                 if sides.turns % 2:
                     frame = replace(frame, mirrored=not frame.mirrored)
             sound.append(frame)
-        node.frames[:] = sound
-        return decoded, swapped, notes
+        depth.frames[:] = sound

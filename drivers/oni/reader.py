@@ -13,7 +13,8 @@ from selective_depth.drivers.oni.colour import OniColour
 from selective_depth.drivers.oni.files import open_regular, read_payload
 from selective_depth.drivers.oni.form import Sides, turned_at, upright
 from selective_depth.drivers.oni.inspection import inspect_oni
-from selective_depth.drivers.oni.report import OniFrame, OniReport
+from selective_depth.drivers.oni.nodes import OniFrame
+from selective_depth.drivers.oni.report import OniReport
 from selective_depth.drivers.source import DepthSource
 
 
@@ -68,7 +69,7 @@ class OniReader(DepthSource):
                 f"'{path}' is not whole ({self.report.problems[0]}); `selective-depth check` says"
                 " more, and saves what can be saved with --repair.",
             )
-        if any(not problem.harmless for problem in self.report.problems):
+        if self.report.damage is not None:
             self.damage = self.notes[0]
         self.notes += tuple(f"'{path}': {note}." for note in self.report.notes)
         self._frames, self._damage = _trusted_frames(self.report)
@@ -107,19 +108,17 @@ class OniReader(DepthSource):
             raise SourceEndedError(f"'{self.uri}' has ended after {self._next} frames.")
         frame = self._frames[self._next]
         depth_mm = read_depth(self.report, self._file, frame)
-        if depth_mm is not None:
-            turns = self._sides.turns
-            depth_mm = self._sides.put_right(depth_mm)
-            if not turns and self._sides.turns:
-                self.notes += (f"'{self.uri}' {turned_at(frame.number)}",)
         if depth_mm is None:
             self._frames = self._frames[: self._next]
             self._damage = f"byte {frame.record_offset}: frame {frame.number} cannot be decoded"
             raise DamagedRecordingError(self._sentence(self._damage))
+        turns = self._sides.turns
+        depth_mm = self._sides.put_right(depth_mm)
+        if self._sides.turns > turns == 0:
+            self.notes += (f"'{self.uri}' {turned_at(frame.number)}",)
         depth_mm.flags.writeable = False  # handed over: the frame need not copy it
-        index = self._next
+        whole = DepthFrame(depth_mm, self._next, frame.timestamp_us, self.camera, self.uri)
         self._next += 1
-        whole = DepthFrame(depth_mm, index, frame.timestamp_us, self.camera, self.uri)
         return self._colour.on(self._file, whole, self._colouring)
 
     def close(self) -> None:
@@ -148,10 +147,9 @@ def _trusted_frames(report: OniReport) -> tuple[list[OniFrame], str | None]:
     A file that was cut, or whose recorder was killed, has no END mark and no frame beyond what is
     wrong with it: what is there is good.
     """
-    frames = report.depth.frames if report.depth is not None else []
-    damage = next((problem for problem in report.problems if not problem.harmless), None)
+    damage = report.damage
     if damage is None:
-        return frames, None
-    before = [frame for frame in frames if frame.record_offset < damage.offset]
-    cut = not report.ended and len(before) == len(frames) > 0
+        return report.frames, None
+    before = [frame for frame in report.frames if frame.record_offset < damage.offset]
+    cut = not report.ended and 0 < len(before) == report.readable_frames
     return before, None if cut else str(damage)

@@ -105,17 +105,6 @@ class Record:
         return self.payload_offset + self.payload_size
 
 
-@dataclass(frozen=True, slots=True)
-class NodeAddition:
-    """The fields of a NODE_ADDED record; `frames` is None where the recorder never came back."""
-
-    name: str
-    node_type: int
-    codec: bytes
-    frames: int | None
-    seek_table_offset: int
-
-
 def read_record(file: BinaryIO, offset: int, size: int, old: bool) -> Record:
     """Read the record at an offset of an unbuffered file of `size` bytes.
 
@@ -157,39 +146,17 @@ def pack_record(kind: Kind, node: int, fields: bytes = b"", payload: bytes = b""
     return header + fields + payload
 
 
-def parse_addition(record: Record, old: bool) -> NodeAddition:
-    """Read the fields of any of the NODE_ADDED records.
+def unpack_fields(record: Record, form: struct.Struct) -> tuple[int, ...]:
+    """The fields of a record that has no others than numbers.
 
     Raises
     ------
     RecordError
-        If they break the format.
+        If they have another size.
     """
-    name, rest = _split_text(record.fields, MAX_NAME)
-    form = struct.Struct(
-        {Kind.NODE_ADDED_4: "<I4s", Kind.NODE_ADDED_5: "<I4sIQQ", Kind.NODE_ADDED: "<I4sIQQI" if old else "<I4sIQQQ"}[
-            record.kind
-        ]
-    )
-    if len(rest) != form.size:
-        raise RecordError(f"its fields after the name have {len(rest)} bytes instead of {form.size}")
-    values = form.unpack(rest)
-    frames = values[2] if len(values) > 2 else UNKNOWN_COUNT
-    return NodeAddition(
-        name,
-        node_type=values[0],
-        codec=values[1],
-        frames=None if frames == UNKNOWN_COUNT else frames,
-        seek_table_offset=values[5] if len(values) > 5 else 0,
-    )
-
-
-def pack_addition(addition: NodeAddition, latest_us: int = LATEST_TIME, seek_table_offset: int = 0) -> bytes:
-    """Fields of a NODE_ADDED record."""
-    frames = UNKNOWN_COUNT if addition.frames is None else addition.frames
-    return _text(addition.name) + struct.pack(
-        "<I4sIQQQ", addition.node_type, addition.codec, frames, 0, latest_us, seek_table_offset
-    )
+    if len(record.fields) != form.size:
+        raise RecordError(f"it has {len(record.fields)} bytes of fields")
+    return form.unpack(record.fields)
 
 
 def parse_property(record: Record) -> tuple[str, bytes]:
@@ -200,7 +167,7 @@ def parse_property(record: Record) -> tuple[str, bytes]:
     RecordError
         If the record breaks the format.
     """
-    name, rest = _split_text(record.fields, MAX_NAME)
+    name, rest = split_text(record.fields)
     size = int.from_bytes(rest[:4], "little")
     value = rest[4:]
     if len(rest) < 4 or len(value) != size:
@@ -214,19 +181,27 @@ def parse_property(record: Record) -> tuple[str, bytes]:
 
 def pack_property(name: str, value: bytes) -> bytes:
     """Fields of a property record."""
-    return _text(name) + len(value).to_bytes(4, "little") + value
+    return pack_text(name) + len(value).to_bytes(4, "little") + value
 
 
-def _text(text: str) -> bytes:
+def pack_text(text: str) -> bytes:
+    """A text as it stands at the beginning of fields: its length, the text, a zero."""
     data = text.encode("ascii") + b"\0"
     return len(data).to_bytes(4, "little") + data
 
 
-def _split_text(fields: bytes, longest: int) -> tuple[str, bytes]:
+def split_text(fields: bytes) -> tuple[str, bytes]:
+    """The text at the beginning of fields, and what follows it.
+
+    Raises
+    ------
+    RecordError
+        If it is not plain, has no end or is longer than `MAX_NAME`.
+    """
     size = int.from_bytes(fields[:4], "little")
     text = fields[4 : 4 + size]
-    if not 1 <= size <= longest or len(text) != size or text.find(b"\0") != size - 1:
+    if not 1 <= size <= MAX_NAME or len(text) != size or text.find(b"\0") != size - 1:
         raise RecordError("its name is broken")
     if not text[:-1].isascii() or not text[:-1].decode("ascii").isprintable():
-        raise RecordError(f"its name {text[:-1]!r} is no plain text")
+        raise RecordError(f"its name {text[:-1]!r} is not plain text")
     return text[:-1].decode("ascii"), fields[4 + size :]

@@ -14,9 +14,10 @@ from selective_depth.drivers.oni.codec import encode_depth
 from selective_depth.drivers.oni.colour import OniColour
 from selective_depth.drivers.oni.files import open_regular, read_payload
 from selective_depth.drivers.oni.inspection import inspect_oni
+from selective_depth.drivers.oni.nodes import OniNode, in_file_order
 from selective_depth.drivers.oni.reader import read_depth
-from selective_depth.drivers.oni.records import CODEC_NONE, CODEC_TABLE, CODECS, NodeAddition
-from selective_depth.drivers.oni.report import OniFrame, OniReport
+from selective_depth.drivers.oni.records import CODEC_NONE, CODEC_TABLE, CODECS
+from selective_depth.drivers.oni.report import OniReport
 from selective_depth.drivers.oni.writer import RecordWriter, depth_properties
 
 
@@ -52,29 +53,24 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
     report = _rescuable(path)
     assert report.depth is not None and report.camera is not None
     defaults = depth_properties(report.camera, report.fps)
+    kept = [node for node in report.nodes if not node.is_stream or (node.ready and node.codec in CODECS)]
     with open_regular(report.path) as file:
         writer = RecordWriter(Path(out_path))
         try:
-            frames: list[tuple[int, OniFrame]] = []
-            for node in report.nodes:
-                if node.is_stream and not (node.ready and node.codec in CODECS):
-                    continue
+            for node in kept:
                 properties, codec = node.properties, node.codec
                 if node is report.depth:  # it is written as it is delivered
                     properties = {**defaults, **(properties if report.as_stored else {})}
                     codec = CODEC_NONE if codec == CODEC_NONE else CODEC_TABLE
-                addition = NodeAddition(node.name, node.node_type, codec, None, 0)
-                writer.add_node(node.number, addition, properties)
-                frames += [(node.number, frame) for frame in node.frames]
+                writer.add_node(OniNode(node.number, node.name, node.node_type, codec, properties))
             writer.begin()
-            for number, frame in sorted(frames, key=lambda item: item[1].record_offset):
+            for node, frame in in_file_order(kept):
                 payload = read_payload(file, frame)
-                if number == report.depth.number:
+                if node is report.depth:
                     depth_mm = read_depth(report, file, frame)
                     assert depth_mm is not None  # decoded a moment ago
-                    plain = report.depth.codec == CODEC_NONE
-                    payload = depth_mm.astype("<u2").tobytes() if plain else encode_depth(depth_mm)
-                writer.add_frame(number, frame.timestamp_us, payload)
+                    payload = encode_depth(depth_mm, writer.nodes[node.number].codec)
+                writer.add_frame(node.number, frame.timestamp_us, payload)
         finally:
             writer.close()
     return inspect_oni(out_path, decode=True, timeout_s=float("inf"))

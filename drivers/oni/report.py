@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import struct
+from bisect import insort
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
 
 from selective_depth.drivers.frame import Camera
-from selective_depth.drivers.oni.records import Kind, NodeType
-
-STREAMS: Final = frozenset((NodeType.DEPTH, NodeType.IMAGE, NodeType.IR))
-CAMERA: Final = "selectiveDepthCamera"
-"""Our own property: fx, fy, cx, cy of a stream, since a field of view tells no principal point."""
-REGISTERED: Final = "selectiveDepthRegistered"
-"""Our own property of a depth stream: 1 if colour lies on it. OpenNI2's player steps over both."""
+from selective_depth.drivers.oni.nodes import OniFrame, OniNode
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,55 +32,9 @@ class OniProblem:
         return f"byte {self.offset}: {self.sentence}"
 
 
-@dataclass(frozen=True, slots=True)
-class OniFrame:
-    """One frame of a node: its place in the file, its number (from 1) and its time."""
-
-    number: int
-    timestamp_us: int
-    record_offset: int
-    payload_offset: int
-    payload_size: int
-    mirrored: bool = False
-
-
 @dataclass
-class OniNode:
-    """One stream (or the device) of a recording."""
-
-    number: int
-    name: str
-    node_type: int
-    codec: bytes
-    declared_frames: int | None
-    seek_table_offset: int
-    offset: int
-    properties: dict[str, tuple[Kind, bytes]] = field(default_factory=dict)
-    frames: list[OniFrame] = field(default_factory=list)
-    ready: bool = False
-    removed: bool = False
-    has_seek_table: bool = False
-    changed: bool = False
-
-    @property
-    def is_stream(self) -> bool:
-        """True if the node delivers frames."""
-        return self.node_type in STREAMS
-
-    def number_of(self, name: str) -> int | None:
-        """Value of a whole-number property, None if it is not there."""
-        kind, value = self.properties.get(name, (None, b""))
-        return int.from_bytes(value, "little") if kind is Kind.INT_PROPERTY else None
-
-    def values_of(self, name: str, form: str) -> tuple[float, ...] | None:
-        """Values of a structured property, None if it is not there or has another size."""
-        value = self.properties.get(name, (None, b""))[1]
-        return struct.unpack(form, value) if len(value) == struct.calcsize(form) else None
-
-
-@dataclass(frozen=True)
 class OniReport:
-    """What an .oni file holds and what is wrong with it.
+    """What an .oni file holds and what is wrong with it, filled in by `inspect_oni`.
 
     Parameters
     ----------
@@ -97,13 +44,15 @@ class OniReport:
         Its length.
     version : str
         Version of the format, as "1.0.1.0"; empty if the header is broken.
+    old : bool
+        True for versions before 1.0.1.0.
     nodes : tuple of OniNode
         Everything that was recorded, in the file's order.
     depth : OniNode or None
         The depth stream; its `frames` are the readable ones.
     camera : Camera or None
-        Intrinsics from the recorded field of view (a Kinect's where there is none); None if the
-        frame size is unknown.
+        Intrinsics of the depth frames from the recorded field of view (a Kinect's where there is
+        none); its size is theirs, cropped as they are. None if the frame size is unknown.
     fps : float
         Recorded frame rate.
     tenths : bool
@@ -112,42 +61,61 @@ class OniReport:
         Why a file that is in order cannot be read; empty if it can.
     notes : tuple of str
         What is done to the frames, or else worth knowing, though nothing is wrong.
-    problems : tuple of OniProblem
+    problems : list of OniProblem
         By offset; empty if nothing is wrong.
-    ended : bool
-        True if the recorder closed the file.
-    tail_bytes : int
-        Bytes after the end, which OpenNI2's recorder leaves as zeros.
-    old : bool
-        True for versions before 1.0.1.0.
+    end_offset : int or None
+        Where its last record ends; None if its recorder never closed it.
     decoded_frames : int
         Number of depth frames that were also decoded, not only found.
     swapped_frames : int
         Number of these in which OpenNI2's recorder swapped the last pixels, so that its player
-        shows up to 28 wrong ones (see `oni_codec`). They are read rightly here.
+        shows up to 28 wrong ones (see `codec`). They are read rightly here.
     """
 
     path: Path
     size_bytes: int
-    version: str
-    nodes: tuple[OniNode, ...]
-    depth: OniNode | None
-    camera: Camera | None
-    fps: float
-    tenths: bool
-    unsupported: str
-    notes: tuple[str, ...]
-    problems: tuple[OniProblem, ...]
-    ended: bool
-    tail_bytes: int
-    old: bool
-    decoded_frames: int
-    swapped_frames: int
+    version: str = ""
+    old: bool = False
+    nodes: tuple[OniNode, ...] = ()
+    depth: OniNode | None = None
+    camera: Camera | None = None
+    fps: float = 30.0
+    tenths: bool = False
+    unsupported: str = ""
+    notes: tuple[str, ...] = ()
+    problems: list[OniProblem] = field(default_factory=list)
+    end_offset: int | None = None
+    decoded_frames: int = 0
+    swapped_frames: int = 0
+
+    def problem(self, offset: int, sentence: str, *, harmless: bool = False) -> None:
+        """Add something that is wrong."""
+        insort(self.problems, OniProblem(offset, sentence, harmless), key=lambda each: each.offset)
+
+    @property
+    def frames(self) -> list[OniFrame]:
+        """The readable depth frames."""
+        return self.depth.frames if self.depth is not None else []
 
     @property
     def readable_frames(self) -> int:
         """Number of depth frames that are all there."""
-        return len(self.depth.frames) if self.depth is not None else 0
+        return len(self.frames)
+
+    @property
+    def damage(self) -> OniProblem | None:
+        """The first problem that is not harmless, None if there is none."""
+        return next((problem for problem in self.problems if not problem.harmless), None)
+
+    @property
+    def ended(self) -> bool:
+        """True if the recorder closed the file."""
+        return self.end_offset is not None
+
+    @property
+    def tail_bytes(self) -> int:
+        """Bytes after the end, which OpenNI2's recorder leaves as zeros."""
+        return 0 if self.end_offset is None else self.size_bytes - self.end_offset
 
     @property
     def complete(self) -> bool:
@@ -157,19 +125,16 @@ class OniReport:
     @property
     def as_stored(self) -> bool:
         """True if frames are delivered as they are stored: same side, unit and size."""
-        frames = self.depth.frames if self.depth is not None else []
         crop = (self.depth.values_of("xnCropping", "<IHHHH") if self.depth else None) or (0,)
-        return not (self.tenths or crop[0] or any(frame.mirrored for frame in frames))
+        return not (self.tenths or crop[0] or any(frame.mirrored for frame in self.frames))
 
     @property
     def openable(self) -> bool:
         """True if OpenNI2's player can be given the file: it delivers `readable_frames`."""
-        return self.readable_frames > 0 and all(problem.harmless for problem in self.problems)
+        return self.readable_frames > 0 and self.damage is None
 
     @property
     def duration_s(self) -> float:
         """Seconds from the first to the last readable depth frame."""
-        if self.depth is None or not self.depth.frames:
-            return 0.0
-        frames = self.depth.frames
-        return (frames[-1].timestamp_us - frames[0].timestamp_us) / 1e6
+        times_us = [frame.timestamp_us for frame in self.frames]
+        return (times_us[-1] - times_us[0]) / 1e6 if times_us else 0.0

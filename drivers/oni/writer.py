@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, Final, Self
 
-import numpy as np
-
 from selective_depth.drivers.colour import jpeg_of
-from selective_depth.drivers.errors import OutputError
+from selective_depth.drivers.errors import OutputError, unwritten
 from selective_depth.drivers.frame import Camera, ColourArray, DepthArray, DepthFrame
-from selective_depth.drivers.oni.codec import MAX_DISTINCT, decode_depth, encode_depth
+from selective_depth.drivers.oni.codec import decode_depth, encode_depth
 from selective_depth.drivers.oni.files import read_payload
+from selective_depth.drivers.oni.nodes import (
+    CAMERA,
+    REGISTERED,
+    OniFrame,
+    OniNode,
+    Property,
+    in_file_order,
+    integer,
+    structure,
+)
 from selective_depth.drivers.oni.records import (
     BEGIN_FIELDS,
     CODEC_JPEG,
@@ -31,35 +38,18 @@ from selective_depth.drivers.oni.records import (
     UNKNOWN_COUNT,
     VERSION,
     Kind,
-    NodeAddition,
     NodeType,
-    pack_addition,
     pack_property,
     pack_record,
 )
-from selective_depth.drivers.oni.report import CAMERA, REGISTERED
-from selective_depth.drivers.source import DepthSource
 
 _MAX_DEPTH_MM: Final = 65535
 _DEPTH_1_MM: Final = 100  # OpenNI2's number of this pixel format
 _GREY_16_BIT: Final = 4  # and OpenNI 1's
 _RGB_888: Final = 200
 _RGB_24_BIT: Final = 1
-_DEFAULT_FPS: Final = 30.0
 JPEG_QUALITY: Final = 92
 """Of recorded colour: it is off by less than its sensor's noise."""
-
-Property = tuple[Kind, bytes]
-
-
-def integer(value: int) -> Property:
-    """A whole-number property."""
-    return Kind.INT_PROPERTY, value.to_bytes(8, "little")
-
-
-def structure(form: str, *values: float) -> Property:
-    """A structured property."""
-    return Kind.GENERAL_PROPERTY, struct.pack(form, *values)
 
 
 class RecordWriter:
@@ -85,43 +75,38 @@ class RecordWriter:
     def __init__(self, path: Path, *, keep: bool = False) -> None:
         self.path = path
         self._keep = keep
+        self.nodes: dict[int, OniNode] = {}
+        self._offset = self._latest_us = 0
         try:
             self._file: BinaryIO = path.open("xb", buffering=0)  # whole in the file at every record
         except FileExistsError:
             raise OutputError(f"'{path}' exists already; give another name, or remove it.") from None
         except OSError as error:
-            raise self._failed(error) from error
-        self._offset = self.payload_offset = self.payload_size = 0
-        self._nodes: dict[int, NodeAddition] = {}
-        self._node_offsets: dict[int, int] = {}
-        self._entries: dict[int, list[tuple[int, int, int]]] = {}
-        self._latest_us = 0
+            raise unwritten(path, error) from error
         self._append(self._header(LATEST_TIME))
 
-    def add_node(self, number: int, addition: NodeAddition, properties: dict[str, Property]) -> None:
-        """Add a stream and what is known of it."""
-        self._nodes[number] = addition
-        self._entries[number] = []
-        self._node_offsets[number] = self._append(pack_record(Kind.NODE_ADDED, number, pack_addition(addition)))
-        for name, (kind, value) in properties.items():
-            self._append(pack_record(kind, number, pack_property(name, value)))
-        self._append(pack_record(Kind.STATE_READY, number))
+    def add_node(self, node: OniNode) -> None:
+        """Add a stream and what is known of it; its frames are those that are written from here on."""
+        self.nodes[node.number] = node
+        node.offset = self._append(pack_record(Kind.NODE_ADDED, node.number, node.addition()))
+        for name, (kind, value) in node.properties.items():
+            self._append(pack_record(kind, node.number, pack_property(name, value)))
+        self._append(pack_record(Kind.STATE_READY, node.number))
 
     def begin(self) -> None:
         """Announce the frames, once all nodes are there."""
-        for number, addition in self._nodes.items():
-            if addition.node_type in (NodeType.DEPTH, NodeType.IMAGE, NodeType.IR):
+        for node in self.nodes.values():
+            if node.is_stream:
                 fields = BEGIN_FIELDS.pack(UNKNOWN_COUNT, LATEST_TIME)
-                self._append(pack_record(Kind.DATA_BEGIN, number, fields))
+                self._append(pack_record(Kind.DATA_BEGIN, node.number, fields))
 
-    def add_frame(self, node: int, timestamp_us: int, payload: bytes) -> None:
-        """Add the next frame of a node."""
-        entries = self._entries[node]
-        previous = entries[-1][2] if entries else 0
-        fields = FRAME_FIELDS.pack(timestamp_us, len(entries) + 1)
-        offset = self._append(pack_record(Kind.NEW_DATA, node, fields, payload, previous))
-        entries.append((timestamp_us, 0, offset))
-        self.payload_offset, self.payload_size = self._offset - len(payload), len(payload)
+    def add_frame(self, number: int, timestamp_us: int, payload: bytes) -> None:
+        """Add the next frame of the node of a number."""
+        frames = self.nodes[number].frames
+        previous = frames[-1].record_offset if frames else 0
+        fields = FRAME_FIELDS.pack(timestamp_us, len(frames) + 1)
+        offset = self._append(pack_record(Kind.NEW_DATA, number, fields, payload, previous))
+        frames.append(OniFrame(len(frames) + 1, timestamp_us, offset, self._offset - len(payload), len(payload)))
         self._latest_us = max(self._latest_us, timestamp_us)
 
     def close(self) -> None:
@@ -142,28 +127,22 @@ class RecordWriter:
             self.path.unlink(missing_ok=True)
 
     def _finish(self) -> None:
-        additions = []
-        for number, node in self._nodes.items():
-            start = self._node_offsets[number]
-            self._append(pack_record(Kind.NODE_REMOVED, number, undone_offset=start))
-            entries = self._entries[number]
-            table = b"".join(SEEK_ENTRY.pack(*entry) for entry in [(0, 0, 0), *entries])
-            table_offset = 0
-            if entries and len(table) <= MAX_PAYLOAD:  # longer, OpenNI2 refuses; it may be missing
-                table_offset = self._append(pack_record(Kind.SEEK_TABLE, number, payload=table))
-            counted = NodeAddition(node.name, node.node_type, node.codec, len(entries), table_offset)
-            latest_us = entries[-1][0] if entries else 0
-            additions.append((start, number, pack_addition(counted, latest_us, table_offset)))
+        for node in self.nodes.values():
+            self._append(pack_record(Kind.NODE_REMOVED, node.number, undone_offset=node.offset))
+            entries = [(0, 0, 0), *((frame.timestamp_us, 0, frame.record_offset) for frame in node.frames)]
+            table = b"".join(SEEK_ENTRY.pack(*entry) for entry in entries)
+            if node.frames and len(table) <= MAX_PAYLOAD:  # longer, OpenNI2 refuses; it may be missing
+                node.seek_table_offset = self._append(pack_record(Kind.SEEK_TABLE, node.number, payload=table))
+            node.declared_frames = len(node.frames)
         self._append(pack_record(Kind.END, 0))
-        for start, number, fields in additions:
-            self._file.seek(start)
-            self._file.write(pack_record(Kind.NODE_ADDED, number, fields))
+        for node in self.nodes.values():
+            self._file.seek(node.offset)
+            self._file.write(pack_record(Kind.NODE_ADDED, node.number, node.addition()))
         self._file.seek(0)
         self._file.write(self._header(self._latest_us))
 
     def _header(self, latest_us: int) -> bytes:
-        highest = max(self._nodes, default=1)
-        return FILE_HEADER.pack(IDENTITY, *VERSION, latest_us, highest)
+        return FILE_HEADER.pack(IDENTITY, *VERSION, latest_us, max(self.nodes, default=1))
 
     def _append(self, data: bytes) -> int:
         offset, left = self._offset, memoryview(data)
@@ -183,12 +162,7 @@ class RecordWriter:
                     self._file.truncate(self._file.seek(self._offset))
             else:
                 self.discard()
-            raise self._failed(error) from error
-
-    def _failed(self, error: OSError) -> OutputError:
-        return OutputError(
-            f"'{self.path}' cannot be written ({error.strerror}); check the folder, its permissions and the free space."
-        )
+            raise unwritten(self.path, error) from error
 
 
 class OniWriter:
@@ -218,10 +192,9 @@ class OniWriter:
     more different depths than that can say: then the file is written anew without.
     """
 
-    def __init__(self, path: str | Path, *, fps: float = _DEFAULT_FPS, keep: bool = False) -> None:
+    def __init__(self, path: str | Path, *, fps: float = 30.0, keep: bool = False) -> None:
         self._fps = fps
         self._keep = keep
-        self._camera: Camera | None = None
         self._first: DepthFrame | None = None
         self._first_us = 0
         self._colour_us: int | None = None
@@ -240,12 +213,11 @@ class OniWriter:
         OutputError
             If it cannot be written, as on a full disk.
         """
-        if self._camera is None:
-            self._begin(frame)
-        elif frame.camera != self._camera:
+        first = self._first or self._begin(frame)
+        if frame.camera != first.camera:
             raise ValueError(
                 f"frame {frame.index} has {frame.camera}, but '{self._writer.path}' is of"
-                f" {self._camera}; write it to another file"
+                f" {first.camera}; write it to another file"
             )
         since_us = frame.timestamp_us - self._first_us
         if since_us < 0:
@@ -254,16 +226,16 @@ class OniWriter:
                 " round or jumped back. Give rising timestamps_us in the folder's frames.toml (2^32 more from there"
                 " on, for a clock of 32 bits), or export to a folder"
             )
-        if self._codec == CODEC_TABLE and np.unique(frame.depth_mm).size > MAX_DISTINCT:
-            self._start_plain()
+        try:
+            payload = encode_depth(frame.depth_mm, self._codec)
+        except ValueError:  # too many different depths for the compression
+            self._start_plain(first)
+            payload = encode_depth(frame.depth_mm, self._codec)
         if frame.colour is not None:
-            self._write_colour(frame.colour, frame.colour_us or 0)
-        payload = encode_depth(frame.depth_mm) if self._codec == CODEC_TABLE else frame.depth_mm.astype("<u2").tobytes()
+            self._write_colour(first, frame.colour, frame.colour_us or 0)
         self._writer.add_frame(1, since_us, payload)
 
-    def _write_colour(self, colour: ColourArray, time_us: int) -> None:
-        first = self._first
-        assert first is not None
+    def _write_colour(self, first: DepthFrame, colour: ColourArray, time_us: int) -> None:
         if first.colour is None or first.colour.shape != colour.shape:
             self.colourless += 1
         elif self._colour_us is None or time_us > self._colour_us:  # else it stands in the file already
@@ -272,15 +244,14 @@ class OniWriter:
 
     def read_back(self) -> DepthArray | None:
         """The last frame as it stands in the file; None if it cannot be decoded."""
-        assert self._camera is not None
+        assert self._first is not None
         with self._writer.path.open("rb") as file:
-            file.seek(self._writer.payload_offset)
-            payload = file.read(self._writer.payload_size)
-        return decode_depth(self._codec, payload, self._camera.height, self._camera.width)
+            payload = read_payload(file, self._writer.nodes[1].frames[-1])
+        return decode_depth(self._codec, payload, *self._first.shape)
 
     def close(self) -> None:
         """Finish the file; without a frame there is none."""
-        if self._camera is None:
+        if self._first is None:
             self._writer.discard()
         self._writer.close()
 
@@ -292,83 +263,48 @@ class OniWriter:
             self._writer.discard()  # a source that failed leaves what it gave; a writer, nothing
         self.close()
 
-    def _begin(self, frame: DepthFrame) -> None:
-        camera = frame.camera
+    def _begin(self, first: DepthFrame) -> DepthFrame:
+        camera = first.camera
         if 2 * camera.width * camera.height > MAX_PAYLOAD:
             raise ValueError(
                 f"frames of {camera.width}x{camera.height} pixels are too large for an .oni file;"
                 " write a folder of PNG frames"
             )
-        self._camera = camera
-        self._first = frame
-        self._first_us = min(frame.timestamp_us, frame.timestamp_us if frame.colour_us is None else frame.colour_us)
-        self._add_nodes(frame)
+        self._first = first
+        self._first_us = first.timestamp_us if first.colour_us is None else min(first.timestamp_us, first.colour_us)
+        self._add_nodes(first)
+        return first
 
     def _add_nodes(self, first: DepthFrame) -> None:
-        depth = NodeAddition("Depth", NodeType.DEPTH, self._codec, None, 0)
-        more = {REGISTERED: integer(int(first.registered))} if first.colour is not None else {}
-        self._writer.add_node(1, depth, depth_properties(first.camera, self._fps) | more)
+        known = depth_properties(first.camera, self._fps)
         if first.colour is not None:
-            image = NodeAddition("Image", NodeType.IMAGE, CODEC_JPEG, None, 0)
-            self._writer.add_node(2, image, colour_properties(first, self._fps))
+            known[REGISTERED] = integer(int(first.registered))
+        self._writer.add_node(OniNode(1, "Depth", NodeType.DEPTH, self._codec, known))
+        if first.colour is not None:
+            image = OniNode(2, "Image", NodeType.IMAGE, CODEC_JPEG, colour_properties(first, self._fps))
+            self._writer.add_node(image)
         self._writer.begin()
 
-    def _start_plain(self) -> None:
+    def _start_plain(self, first: DepthFrame) -> None:
         """Write what is there again, uncompressed."""
-        from selective_depth.drivers.oni.inspection import inspect_oni
-
-        assert self._first is not None
-        path = self._writer.path
+        path, written = self._writer.path, self._writer.nodes
         self._codec = CODEC_NONE
         compressed = path.with_name(f"{path.name}.part")
         self._writer.close()
         path.replace(compressed)
         try:
             self._writer = RecordWriter(path, keep=self._keep)
-            self._add_nodes(self._first)
-            frames = [(node, frame) for node in inspect_oni(compressed).nodes for frame in node.frames]
+            self._add_nodes(first)
             with compressed.open("rb") as file:
-                for node, frame in sorted(frames, key=lambda item: item[1].record_offset):
+                for node, frame in in_file_order(written.values()):
                     payload = read_payload(file, frame)
                     if node.node_type == NodeType.DEPTH:
-                        depth_mm = decode_depth(CODEC_TABLE, payload, *self._first.shape)
+                        depth_mm = decode_depth(CODEC_TABLE, payload, *first.shape)
                         assert depth_mm is not None  # encoded here
-                        payload = depth_mm.astype("<u2").tobytes()
+                        payload = encode_depth(depth_mm, CODEC_NONE)
                     self._writer.add_frame(node.number, frame.timestamp_us, payload)
         finally:
             compressed.unlink(missing_ok=True)
-
-
-def write_oni(path: str | Path, frames: Iterable[DepthFrame], *, fps: float | None = None) -> int:
-    """Save frames as an .oni file.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file; must not exist.
-    frames : iterable of DepthFrame
-        All of one camera; an open `DepthSource` is one.
-    fps : float, optional
-        Nominal frame rate; default that of the source, or 30.
-
-    Returns
-    -------
-    int
-        Number of frames written.
-
-    Raises
-    ------
-    OutputError
-        If the file exists or cannot be written.
-    """
-    if fps is None:
-        fps = frames.fps if isinstance(frames, DepthSource) else _DEFAULT_FPS
-    count = 0
-    with OniWriter(path, fps=fps) as recording:
-        for frame in frames:
-            recording.write(frame)
-            count += 1
-    return count
 
 
 def depth_properties(camera: Camera, fps: float) -> dict[str, Property]:
@@ -377,7 +313,7 @@ def depth_properties(camera: Camera, fps: float) -> dict[str, Property]:
     whole_fps = min(max(round(fps), 1), 1000)
     fov_x_rad = 2 * math.atan(width / (2 * camera.fx))
     fov_y_rad = 2 * math.atan(height / (2 * camera.fy))
-    own = {CAMERA: structure("<dddd", camera.fx, camera.fy, camera.cx, camera.cy)}
+    own = {CAMERA: structure("<dddd", *camera.intrinsics)}
     return {
         "oniRequiredFrameSize": integer(2 * width * height),
         "xnIsGenerating": integer(1),

@@ -16,16 +16,9 @@ from selective_depth.drivers.frame import Camera
 from selective_depth.drivers.oni import inspect_oni, repair_oni
 from selective_depth.drivers.oni.codec import encode_depth
 from selective_depth.drivers.oni.form import mended_times
-from selective_depth.drivers.oni.records import (
-    CODEC_TABLE,
-    HEADER,
-    Kind,
-    NodeAddition,
-    NodeType,
-    pack_property,
-    pack_record,
-)
-from selective_depth.drivers.oni.writer import Property, RecordWriter, depth_properties, integer, structure
+from selective_depth.drivers.oni.nodes import OniNode, Property, integer, structure
+from selective_depth.drivers.oni.records import CODEC_TABLE, HEADER, Kind, NodeType, pack_property, pack_record
+from selective_depth.drivers.oni.writer import RecordWriter, depth_properties
 from selective_depth.drivers.open import open_source
 
 Depth = npt.NDArray[np.uint16]
@@ -50,8 +43,8 @@ def write(
     """A recording; `between` are properties that change before a frame."""
     writer = RecordWriter(path)
     for node in range(1, streams + 1):
-        depth = NodeAddition("Depth", NodeType.DEPTH, CODEC_TABLE, None, 0)
-        writer.add_node(node, depth, depth_properties(CAMERA, 30) | properties)
+        depth = OniNode(node, "Depth", NodeType.DEPTH, CODEC_TABLE, depth_properties(CAMERA, 30) | properties)
+        writer.add_node(depth)
     writer.begin()
     for number, mm in enumerate(frames):
         for name, (kind, value) in (between or {}).get(number, {}).items():

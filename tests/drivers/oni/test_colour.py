@@ -9,12 +9,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+from oni_layouts import write_oni
 
 from selective_depth.drivers import DepthFrame, open_source
 from selective_depth.drivers.frame import Camera
-from selective_depth.drivers.oni import export_oni, inspect_oni, repair_oni, write_oni
-from selective_depth.drivers.oni.records import NodeAddition, NodeType
-from selective_depth.drivers.oni.writer import RecordWriter, depth_properties, integer, structure
+from selective_depth.drivers.oni import export_oni, inspect_oni, repair_oni
+from selective_depth.drivers.oni.nodes import OniNode, integer, structure
+from selective_depth.drivers.oni.records import NodeType
+from selective_depth.drivers.oni.writer import RecordWriter, depth_properties
 
 CAMERA = Camera(64, 48, 58.0, 58.0, 31.5, 24.25)
 
@@ -115,10 +117,10 @@ def test_uncompressed_colour_of_other_recorders(
 ) -> None:
     path = tmp_path / "x.oni"
     writer = RecordWriter(path)
-    writer.add_node(1, NodeAddition("Depth", NodeType.DEPTH, b"NONE", None, 0), depth_properties(CAMERA, 30))
+    writer.add_node(OniNode(1, "Depth", NodeType.DEPTH, b"NONE", depth_properties(CAMERA, 30)))
     more = {"oniPixelFormat": integer(form), "xnMapOutputMode": structure("<III", 64, 48, 30), "xnMirror": integer(1)}
-    writer.add_node(2, NodeAddition("Image", NodeType.IMAGE, b"NONE", None, 0), more)
-    writer.add_node(3, NodeAddition("IR", NodeType.IR, b"NONE", None, 0), more)
+    writer.add_node(OniNode(2, "Image", NodeType.IMAGE, b"NONE", more))
+    writer.add_node(OniNode(3, "IR", NodeType.IR, b"NONE", more))
     writer.begin()
     image = scene(5)[:, ::-1]
     writer.add_frame(2, 0, (encode or (lambda each: each))(np.ascontiguousarray(image)).tobytes())

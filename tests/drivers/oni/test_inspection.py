@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from conftest import OniSample
+from oni_layouts import write_oni
 from oni_mutations import cuts, mutations
 from raw_oni_player import digest_of, play_all
 from virtual_sensor import record_oni
@@ -25,6 +26,7 @@ from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.oni import OniReader, OniReport, export_oni, inspect_oni, repair_oni
 from selective_depth.drivers.oni.codec import encode_depth
 from selective_depth.drivers.oni.inspection import _Inspection
+from selective_depth.drivers.oni.nodes import OniNode, integer, structure
 from selective_depth.drivers.oni.records import (
     BEGIN_FIELDS,
     CODEC_NONE,
@@ -35,11 +37,10 @@ from selective_depth.drivers.oni.records import (
     MAGIC,
     OLD_HEADER,
     Kind,
-    NodeAddition,
     NodeType,
     pack_property,
 )
-from selective_depth.drivers.oni.writer import OniWriter, RecordWriter, depth_properties, integer, structure, write_oni
+from selective_depth.drivers.oni.writer import OniWriter, RecordWriter, depth_properties
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.openni.runtime import find_runtime
 
@@ -101,7 +102,7 @@ def _assert_same(read: list[DepthFrame], expected: list[DepthFrame]) -> None:
 @pytest.mark.openni
 def test_a_file_of_the_real_recorder_is_read_bit_by_bit(oni_sample: OniSample) -> None:
     report = inspect_oni(oni_sample.path, decode=True)
-    assert report.problems == ()
+    assert not report.problems
     assert report.complete and report.openable
     assert report.readable_frames == len(oni_sample.depth_mm)
     assert report.fps == 30
@@ -182,7 +183,7 @@ def test_without_the_runtime_a_recording_opens_all_the_same(
 
 def test_what_is_written_is_read_back(recording: Path) -> None:
     report = inspect_oni(recording, decode=True)
-    assert report.complete and report.problems == ()
+    assert report.complete and not report.problems
     assert (report.version, report.tail_bytes, report.fps) == ("1.0.1.0", 0, 30)
     assert report.duration_s == pytest.approx(5 * 0.033366)
     frames = _read(recording)
@@ -341,8 +342,7 @@ def test_repair_interpolates_times_that_break_the_order(
     tmp_path: Path, times_us: list[int], mended_us: list[int]
 ) -> None:
     writer = RecordWriter(tmp_path / "odd.oni")
-    depth = NodeAddition("Depth", NodeType.DEPTH, CODEC_TABLE, None, 0)
-    writer.add_node(1, depth, depth_properties(CAMERA, 30))
+    writer.add_node(OniNode(1, "Depth", NodeType.DEPTH, CODEC_TABLE, depth_properties(CAMERA, 30)))
     writer.begin()
     for time_us in times_us:
         writer.add_frame(1, time_us, encode_depth(_frames(1)[0].depth_mm))
@@ -372,7 +372,7 @@ def test_timestamps_are_held_against_the_seek_table(recording: Path) -> None:
         (40, b"\x01", "1 bytes of payload but needs none"),
         (44, b"\xff\xff", "refers ahead"),
         (52, b"\xff\xff", "its name is broken"),
-        (56, b"\x07", "no plain text"),
+        (56, b"\x07", "not plain text"),
         (62, b"\x09", "no depth stream"),
         (66, b"zz", "compression b'zz"),
         (70, b"\x63", "99 Depth frames are announced, 6 are there"),
@@ -435,8 +435,8 @@ def _write(
 ) -> None:
     """A recording of a colour and a depth stream, interleaved."""
     writer = RecordWriter(path)
-    writer.add_node(1, NodeAddition("Image", NodeType.IMAGE, b"JPEG", None, 0), {"Gain": integer(3)})
-    writer.add_node(2, NodeAddition("Depth", NodeType.DEPTH, codec, None, 0), properties)
+    writer.add_node(OniNode(1, "Image", NodeType.IMAGE, b"JPEG", {"Gain": integer(3)}))
+    writer.add_node(OniNode(2, "Depth", NodeType.DEPTH, codec, properties))
     writer.begin()
     for frame in _frames():
         writer.add_frame(1, frame.timestamp_us, b"no real JPEG")
@@ -491,7 +491,7 @@ def test_files_of_openni_1_are_read_and_brought_up_to_date(tmp_path: Path) -> No
     path = tmp_path / "old.oni"
     path.write_bytes(out)
     report = inspect_oni(path, decode=True)
-    assert report.problems == () and report.old and report.complete
+    assert not report.problems and report.old and report.complete
     assert report.camera == Camera(80, 60, 600.0, 600.0, 40.0, 30.0)
     _assert_same(_read(path), _frames())
     repaired = repair_oni(path, tmp_path / "new.oni")
@@ -549,7 +549,7 @@ def test_what_is_no_file_is_said_at_once(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have names on POSIX systems only")
 def test_a_pipe_does_not_hang(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.oni")
-    with pytest.raises(SourceNotFoundError, match="no regular file"):
+    with pytest.raises(SourceNotFoundError, match="not a regular file"):
         inspect_oni(tmp_path / "pipe.oni")
 
 
@@ -601,7 +601,7 @@ def test_a_file_of_nothing_but_broken_records_is_read_once(tmp_path: Path) -> No
             return got
 
     with Counting(path) as file:
-        report = _Inspection(path, file, 10.0).report(decode=False)  # type: ignore[arg-type]
+        report = _Inspection(path, file).report_on()  # type: ignore[arg-type]
     assert not report.complete
     assert read < 4 * path.stat().st_size + (4 << 20)
 
