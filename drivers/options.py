@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import MOST_PX
@@ -27,6 +28,9 @@ def parted(uri: str) -> tuple[str, str]:
     except (OSError, ValueError) as error:  # too long, or with a null byte
         raise SourceNotFoundError(f"'{uri:.60}…' cannot be the name of a file ({error!s:.40}…).") from None
     return name, options
+
+
+_T = TypeVar("_T")
 
 
 class Options:
@@ -60,98 +64,72 @@ class Options:
                 raise SourceNotFoundError(f"option '{name}' of {source} is given twice; keep one")
             self._given[name] = value
 
-    def _take(self, name: str, allowed: str) -> str | None:
+    def _taken(self, name: str, allowed: str, read: Callable[[str], _T], default: _T) -> _T:
+        """What `read` makes of an option; it raises ValueError where that is not what is allowed."""
         self._known.append(f"{name} ({allowed})")
-        return self._given.pop(name, None)
-
-    def _refuse(self, name: str, value: str, allowed: str) -> SourceNotFoundError:
-        return SourceNotFoundError(f"{name}={value} of {self._source}: give {allowed}")
+        value = self._given.pop(name, None)
+        if value is None:
+            return default
+        try:
+            return read(value)
+        except ValueError:
+            raise SourceNotFoundError(f"{name}={value} of {self._source}: give {allowed}") from None
 
     def choice(self, name: str, default: str, allowed: Sequence[str]) -> str:
         """One of the words `allowed`."""
-        words = ", ".join(allowed)
-        value = self._take(name, words)
-        if value is None:
-            return default
-        if value not in allowed:
-            raise self._refuse(name, value, f"one of {words}")
-        return value
+        return self._taken(name, f"one of {', '.join(allowed)}", lambda value: _word(value, allowed), default)
 
     def choices(self, name: str, allowed: Sequence[str]) -> tuple[str, ...]:
         """Any of the words `allowed`, with + between; none by default."""
         words = f"any of {', '.join(allowed)}, with + between"
-        value = self._take(name, words)
-        chosen = tuple(value.split("+")) if value else ()
-        if value and not set(chosen) <= set(allowed):
-            raise self._refuse(name, value, words)
-        return chosen
+        return self._taken(name, words, lambda value: tuple(_word(each, allowed) for each in value.split("+")), ())
 
     def integer(self, name: str, default: int, low: int, high: int) -> int:
         """A whole number from `low` to `high`."""
         allowed = f"a whole number from {low} to {high}"
-        value = self._take(name, allowed)
-        if value is None:
-            return default
-        # isdecimal alone admits the digits of every script, which int() reads as well.
-        if not (value.isascii() and value.isdecimal() and len(value) < 20):
-            raise self._refuse(name, value, allowed)
-        if not low <= int(value) <= high:
-            raise self._refuse(name, value, allowed)
-        return int(value)
+        return self._taken(name, allowed, lambda value: _whole(value, low, high), default)
 
     def number(self, name: str, default: float, low: float, high: float) -> float:
         """A number from `low` to `high`."""
         allowed = f"a number from {low:g} to {high:g}"
-        value = self._take(name, allowed)
-        if value is None:
-            return default
-        try:
-            number = float(value)
-        except ValueError:
-            raise self._refuse(name, value, allowed) from None
-        if not low <= number <= high:  # NaN fails as well
-            raise self._refuse(name, value, allowed)
-        return number
+        return self._taken(name, allowed, lambda value: _number(value, low, high), default)
 
     def change(self, name: str, allowed: Sequence[str]) -> tuple[str, int] | None:
         """One of the words `allowed` and a frame's number, written ``word@20``; None by default."""
-        words = f"one of {', '.join(allowed)}, @ and the number of a frame, such as {allowed[0]}@20"
-        value = self._take(name, words)
-        if value is None:
-            return None
-        word, _, number = value.partition("@")
-        if word not in allowed or not (number.isascii() and number.isdecimal() and len(number) < 9):
-            raise self._refuse(name, value, words)
-        return word, int(number)
 
-    def numbers(
-        self, name: str, what: str, low: float, high: float, between: str = ",", *, words: str = ""
-    ) -> tuple[float, ...] | None:
-        """Numbers from `low` to `high`, as many as `what` names; None if absent. `words` may be given as well."""
-        count = len(re.split(between, what))
-        allowed = f"{words}{what}, {'each ' * (count > 1)}a number from {low:g} to {high:g}"
-        value = self._take(name, allowed)
-        if value is None:
-            return None
-        try:
-            numbers = tuple(float(word) for word in re.split(between, value))
-        except ValueError:
-            raise self._refuse(name, value, allowed) from None
-        if len(numbers) != count or not all(low <= number <= high for number in numbers):
-            raise self._refuse(name, value, allowed)
-        return numbers
+        def read(value: str) -> tuple[str, int] | None:
+            word, _, number = value.partition("@")
+            return _word(word, allowed), _whole(number, 0, 99_999_999)
+
+        words = f"one of {', '.join(allowed)}, @ and the number of a frame, such as {allowed[0]}@20"
+        return self._taken(name, words, read, None)
+
+    def numbers(self, name: str, what: str, low: float, high: float, between: str = ",") -> tuple[float, ...] | None:
+        """Numbers from `low` to `high`, as many as `what` names; None if absent."""
+        given = self.words_or_numbers(name, (), what, low, high, between)
+        return given if isinstance(given, tuple) else None
 
     def words_or_numbers(
-        self, name: str, words: Sequence[str], what: str, low: float, high: float
+        self, name: str, words: Sequence[str], what: str, low: float, high: float, between: str = ","
     ) -> str | tuple[float, ...]:
-        """One of the words, the first by default, or numbers as `numbers` takes them."""
-        if self._given.get(name, words[0]) in words:
-            return self.choice(name, words[0], words)
-        return self.numbers(name, what, low, high, words=f"{', '.join(words)}, or ") or ""
+        """One of the words, the first by default, or numbers from `low` to `high`, as many as `what` names."""
+        count = len(re.split(between, what))
+
+        def read(value: str) -> str | tuple[float, ...]:
+            if value in words:
+                return value
+            numbers = tuple(_number(each, low, high) for each in re.split(between, value))
+            if len(numbers) != count:
+                raise ValueError(value)
+            return numbers
+
+        numbers = f"{what}, {'each ' * (count > 1)}a number from {low:g} to {high:g}"
+        default: str | tuple[float, ...] = words[0] if words else ""
+        return self._taken(name, f"{', '.join(words)}, or {numbers}" if words else numbers, read, default)
 
     def text(self, name: str, what: str) -> str:
         """Any text; empty if absent."""
-        return self._take(name, what) or ""
+        return self._taken(name, what, str, "")
 
     def scale(self) -> float | None:
         """The values per metre that were given for a source."""
@@ -164,20 +142,36 @@ class Options:
 
     def size(self, name: str, default: tuple[int, int]) -> tuple[int, int]:
         """Width and height in pixels, written ``640x480``."""
+
+        def read(value: str) -> tuple[int, int]:
+            width, _, height = value.partition("x")
+            return _whole(width, SMALLEST, LARGEST), _whole(height, SMALLEST, LARGEST)
+
         allowed = f"WIDTHxHEIGHT such as 640x480, each from {SMALLEST} to {LARGEST} pixels"
-        value = self._take(name, allowed)
-        if value is None:
-            return default
-        width, _, height = value.partition("x")
-        for side in (width, height):
-            if not (side.isascii() and side.isdecimal() and len(side) < 6):
-                raise self._refuse(name, value, allowed)
-            if not SMALLEST <= int(side) <= LARGEST:
-                raise self._refuse(name, value, allowed)
-        return int(width), int(height)
+        return self._taken(name, allowed, read, default)
 
     def done(self) -> None:
         """Refuse what is left, naming what there is."""
         if self._given:
             unknown = ", ".join(f"'{name}'" for name in sorted(self._given))
             raise SourceNotFoundError(f"{self._source} has no option {unknown}; it has {', '.join(self._known)}")
+
+
+def _word(text: str, allowed: Sequence[str]) -> str:
+    if text not in allowed:
+        raise ValueError(text)
+    return text
+
+
+def _whole(text: str, low: int, high: int) -> int:
+    # isdecimal alone admits the digits of every script, which int() reads as well.
+    if not (text.isascii() and text.isdecimal() and len(text) < 20 and low <= int(text) <= high):
+        raise ValueError(text)
+    return int(text)
+
+
+def _number(text: str, low: float, high: float) -> float:
+    number = float(text)
+    if not low <= number <= high:  # NaN fails as well
+        raise ValueError(text)
+    return number
