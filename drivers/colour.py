@@ -99,10 +99,9 @@ def jpeg_of(colour: ColourArray, quality: int) -> bytes:
 def nearest(times_us: Sequence[int], time_us: int) -> int | None:
     """Index of the time nearest to another, of a rising list; None if none is within `PAIR_US`."""
     at = bisect_left(times_us, time_us)
-    best = min(
-        (k for k in (at - 1, at) if 0 <= k < len(times_us)), key=lambda k: abs(times_us[k] - time_us), default=None
-    )
-    return best if best is not None and abs(times_us[best] - time_us) <= PAIR_US else None
+    off_us = {k: abs(times_us[k] - time_us) for k in (at - 1, at) if 0 <= k < len(times_us)}
+    best = min(off_us, key=off_us.__getitem__, default=None)
+    return best if best is not None and off_us[best] <= PAIR_US else None
 
 
 @dataclass(frozen=True)
@@ -156,11 +155,8 @@ class Colouring:
         registered = registered if self.registered is None else self.registered
         camera = Camera(width, height, *self.intrinsics) if self.intrinsics else None
         if not registered and self.registered is None and camera and self.place_mm:
-            colour, camera, registered = (
-                on_depth(frame.depth_mm, frame.camera, colour, camera, self.place_mm),
-                None,
-                True,
-            )
+            colour = on_depth(frame.depth_mm, frame.camera, colour, camera, self.place_mm)
+            camera, registered = None, True
         registered = registered and colour.shape[:2] == frame.shape
         return replace(frame, colour=colour, colour_us=time_us, colour_camera=camera, registered=registered)
 

@@ -53,18 +53,15 @@ class Camera:
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise ValueError(f"camera size is {self.width}x{self.height} pixels; both must be at least 1")
-        for name in ("fx", "fy"):
-            if not LEAST_FOCAL_PX <= getattr(self, name) <= MOST_PX:
-                raise ValueError(
-                    f"the focal length {name} is {getattr(self, name)} pixels; it must be from"
-                    f" {LEAST_FOCAL_PX:g} to {MOST_PX:g}"
-                )
-        for name in ("cx", "cy"):
-            if not -MOST_PX <= getattr(self, name) <= MOST_PX:
-                raise ValueError(
-                    f"the principal point's {name} is {getattr(self, name)} pixels; it must be from"
-                    f" {-MOST_PX:g} to {MOST_PX:g}"
-                )
+        for name, of_what, least in (
+            ("fx", "focal length", LEAST_FOCAL_PX),
+            ("fy", "focal length", LEAST_FOCAL_PX),
+            ("cx", "principal point's", -MOST_PX),
+            ("cy", "principal point's", -MOST_PX),
+        ):
+            value = getattr(self, name)
+            if not least <= value <= MOST_PX:
+                raise ValueError(f"the {of_what} {name} is {value} pixels; it must be from {least:g} to {MOST_PX:g}")
 
     @classmethod
     def from_fov(cls, width: int, height: int, fov_x_rad: float, fov_y_rad: float) -> Camera:
@@ -185,41 +182,24 @@ class DepthFrame:
     registered: bool = False
 
     def __post_init__(self) -> None:
-        depth = self.depth_mm
-        # Asked of the object: the annotation does not keep a caller from giving a list.
-        kind = getattr(depth, "dtype", type(depth).__name__)
-        shape = getattr(depth, "shape", ())
-        unsigned_16 = isinstance(kind, np.dtype) and kind.kind == "u" and kind.itemsize == 2
-        if not unsigned_16 or len(shape) != 2:
-            raise ValueError(f"depth_mm must be a uint16 array of shape (height, width), got {kind} {shape}")
-        if not -MOST_TIME_US <= self.timestamp_us <= MOST_TIME_US:
-            raise ValueError(f"timestamp_us is {self.timestamp_us}; it must lie within {MOST_TIME_US} of 0")
-        if depth.shape != (self.camera.height, self.camera.width):
-            raise ValueError(
-                f"depth_mm has shape {depth.shape}, but the camera is {self.camera.height} rows"
-                f" by {self.camera.width} columns"
-            )
-        object.__setattr__(self, "depth_mm", _kept(depth, np.uint16))
+        _check_image("depth_mm", self.depth_mm, np.uint16)
+        _check_time("timestamp_us", self.timestamp_us)
+        _check_size("depth_mm", self.depth_mm, "the camera", self.camera)
+        object.__setattr__(self, "depth_mm", _kept(self.depth_mm, np.uint16))
         if self.colour is not None:
             self._check_colour(self.colour)
 
     def _check_colour(self, colour: ColourArray) -> None:
-        kind = getattr(colour, "dtype", type(colour).__name__)
-        shape: tuple[int, ...] = getattr(colour, "shape", ())
-        if kind != np.uint8 or len(shape) != 3 or shape[2] != 3 or 0 in shape:
-            raise ValueError(f"colour must be a uint8 array of shape (height, width, 3), got {kind} {shape}")
-        if self.registered and shape[:2] != self.shape:
+        _check_image("colour", colour, np.uint8, (3,))
+        if self.registered and colour.shape[:2] != self.shape:
             raise ValueError(
-                f"colour has shape {shape}; registered to depth it must have its rows and columns, {self.shape}"
+                f"colour has shape {colour.shape}; registered to depth it must have its rows and columns, {self.shape}"
             )
         camera = self.colour_camera or (self.camera if self.registered else None)
-        if camera is not None and shape[:2] != (camera.height, camera.width):
-            raise ValueError(
-                f"colour has shape {shape}, but its camera is {camera.height} rows by {camera.width} columns"
-            )
+        if camera is not None:
+            _check_size("colour", colour, "its camera", camera)
         time_us = self.timestamp_us if self.colour_us is None else self.colour_us
-        if not -MOST_TIME_US <= time_us <= MOST_TIME_US:
-            raise ValueError(f"colour_us is {time_us}; it must lie within {MOST_TIME_US} of 0")
+        _check_time("colour_us", time_us)
         for name, value in (("colour", _kept(colour, np.uint8)), ("colour_camera", camera), ("colour_us", time_us)):
             object.__setattr__(self, name, value)
 
@@ -247,6 +227,28 @@ class DepthFrame:
     def colours_at(self, uv: npt.NDArray[np.integer]) -> ColourArray | None:
         """Colours of depth pixels (n, 2), shape (n, 3); None where colour does not lie on depth."""
         return self.colour[uv[:, 1], uv[:, 0]] if self.colour is not None and self.registered else None
+
+
+def _check_image(name: str, image: object, kind: type[np.generic], channels: tuple[int, ...] = ()) -> None:
+    # Asked of the object: the annotation does not keep a caller from giving a list.
+    dtype = getattr(image, "dtype", type(image).__name__)
+    shape: tuple[int, ...] = getattr(image, "shape", ())
+    right_kind = isinstance(dtype, np.dtype) and dtype.newbyteorder("=") == kind
+    if not right_kind or len(shape) < 2 or shape[2:] != channels or 0 in shape:
+        form = ", ".join(("height", "width", *map(str, channels)))
+        raise ValueError(f"{name} must be a {kind.__name__} array of shape ({form}), got {dtype} {shape}")
+
+
+def _check_size(name: str, image: npt.NDArray[Any], whose: str, camera: Camera) -> None:
+    if image.shape[:2] != (camera.height, camera.width):
+        raise ValueError(
+            f"{name} has shape {image.shape}, but {whose} is {camera.height} rows by {camera.width} columns"
+        )
+
+
+def _check_time(name: str, time_us: int) -> None:
+    if not -MOST_TIME_US <= time_us <= MOST_TIME_US:
+        raise ValueError(f"{name} is {time_us}; it must lie within {MOST_TIME_US} of 0")
 
 
 def _kept(image: npt.NDArray[Any], kind: type[np.generic]) -> npt.NDArray[Any]:

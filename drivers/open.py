@@ -76,6 +76,6 @@ def open_source(uri: str | Path) -> DepthSource:
     if not path.exists():
         raise SourceNotFoundError(f"'{named}' does not exist. {_WHAT_THERE_IS}")
     raise SourceNotFoundError(
-        f"'{named}' is no depth source: a recording ends in .oni, an object in .ply, an array in"
+        f"'{named}' is not a depth source: a recording ends in .oni, an object in .ply, an array in"
         " .npy or .npz, a ROS bag in .bag or .mcap, and PNG frames are given by their folder."
     )

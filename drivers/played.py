@@ -1,4 +1,4 @@
-"""A recording played from some frame on, in steps, and again from its beginning when it has ended."""
+"""A recording played from some frame on, one frame in so many, and again when it has ended."""
 
 from __future__ import annotations
 

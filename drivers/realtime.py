@@ -56,7 +56,7 @@ class RealtimeSource(DepthSource):
                 return frame
             if self._end is not None:
                 raise self._end
-        raise SourceTimeoutError(f"no frame of '{self.uri}' within {timeout_s:.1f} s; its disk may be slow or away")
+        raise SourceTimeoutError(f"no frame of '{self.uri}' within {timeout_s:.1f} s; its disk may be slow or absent")
 
     def close(self) -> None:
         """Stop playing and close the recording."""

@@ -43,6 +43,6 @@ def readable(path: Path) -> Iterator[None]:
         )
         what = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         raise DamagedRecordingError(
-            f"'{path}' cannot be read as a ROS bag ({what:.160}): it is cut, damaged or has no"
-            f" index. ROS mends it with `{mend}`."
+            f"'{path}' cannot be read as a ROS bag ({what:.160}): it is cut off, damaged or lacks"
+            f" its index. ROS repairs it with `{mend}`."
         ) from error

@@ -6,6 +6,7 @@ import io
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -76,20 +77,18 @@ class BagReader(DepthSource):
         self.uri = str(path)
         self.path = Path(path)
         self.dropped = self._next = 0
-        highlevel = rosbags("highlevel")
-        types = rosbags("typesys")
-        with readable(self.path):
-            store = types.get_typestore(types.Stores.ROS2_HUMBLE)
-            self._bag: Any = highlevel.AnyReader([self.path], default_typestore=store)
-            self._bag.open()
+        self._bag: Any = None
+        highlevel, types = rosbags("highlevel"), rosbags("typesys")
         try:
             with readable(self.path):
+                store = types.get_typestore(types.Stores.ROS2_HUMBLE)
+                self._bag = highlevel.AnyReader([self.path], default_typestore=store)
+                self._bag.open()
                 self._topic = topic = self._choose(topic)
                 unit = self._depth_unit(topic)
                 self.frame_count = self._bag.topics[topic].msgcount
                 self._messages = self._of(topic)
-                time_ns, first = next(self._messages)
-                self._first: tuple[int, Any] | None = (time_ns, first)
+                time_ns, first = next(self._of(topic))
                 raw = self._raw(first)
                 metres = raw.dtype.kind == "f"
                 self._scale = values_per_metre or (1.0 if metres else unit or 1000.0)
@@ -116,8 +115,7 @@ class BagReader(DepthSource):
         if self._bag is None:
             raise SourceEndedError(f"'{self.uri}' has been closed.")
         with readable(self.path):
-            following = self._first or next(self._messages, None)
-            self._first = None
+            following = next(self._messages, None)
             if following is None:
                 raise SourceEndedError(f"'{self.uri}' has ended after {self._next} frames.")
             time_ns, message = following
@@ -128,25 +126,17 @@ class BagReader(DepthSource):
 
     def _open_colour(self, colouring: Colouring, time_ns: int) -> None:
         """Find the colour beside the depth: the image topic whose name has most in common with its."""
-        found = [n for n, t in self._bag.topics.items() if t.msgtype in (_IMAGE, _COMPRESSED) and n != self._topic]
-        found = [n for n in found if not any(part in n.lower() for part in _INFRARED) and self._is_colour(n)]
-        found.sort(key=lambda name: (-_shared(name, self._topic), name))
-        self._colour_topic = found[0] if found and colouring.wanted else ""
+        found = [name for name in self._topics(_IMAGE, _COMPRESSED) if name != self._topic and self._is_colour(name)]
+        nearest_name = min(found, key=lambda name: (-_shared(name, self._topic), name), default="")
+        self._colour_topic = nearest_name if colouring.wanted else ""
         self._registered = any(word in self._topic for word in ("aligned_depth_to_color", "registered"))
-        self._colours = self._of(self._colour_topic) if self._colour_topic else iter(())
+        self._colours = self._of(self._colour_topic)
         self._around: deque[tuple[int, Any]] = deque(maxlen=2)
-        infos = [name for name, t in self._bag.topics.items() if t.msgtype == _CAMERA]
-        name = max(infos, key=lambda name: _shared(name, self._colour_topic), default="")
-        if self._colour_topic and _shared(name, self._colour_topic) > max(1, _shared(self._colour_topic, self._topic)):
-            info = min(self._of(name), key=lambda item: abs(item[0] - time_ns))[1]
-            k = [float(each) for each in (info.K if hasattr(info, "K") else info.k)]
-            colouring = colouring.told_by((k[0], k[4], k[2], k[5]) if k[0] > 0 else None, None)
+        if self._colour_topic:
+            least = max(2, _shared(self._colour_topic, self._topic) + 1)  # else it may be the depth's
+            _, _, told = self._info(self._colour_topic, least, time_ns)
+            colouring = colouring.told_by(told)
         self._colouring = colouring
-
-    def _is_colour(self, topic: str) -> bool:
-        _, message = next(self._of(topic), (0, None))
-        kind = str(getattr(message, "encoding", None) or getattr(message, "format", ""))
-        return kind in _COLOURS or "jp" in kind
 
     def _coloured(self, frame: DepthFrame) -> DepthFrame:
         """A frame with the colour nearest to it in time."""
@@ -163,10 +153,8 @@ class BagReader(DepthSource):
         if hasattr(message, "format"):
             colour = rgb_of_file(io.BytesIO(bytes(message.data)))
         else:
-            rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
             kind = _COLOURS[message.encoding]
-            tight = rows[:, : message.width * CONVERSIONS[kind][1]].tobytes()
-            colour = rgb_of(tight, kind, message.width, message.height)
+            colour = rgb_of(_rows(message, CONVERSIONS[kind][1]), kind, message.width, message.height)
         return frame if colour is None else self._colouring.colour(frame, colour, times_us[at], self._registered)
 
     def close(self) -> None:
@@ -179,6 +167,8 @@ class BagReader(DepthSource):
     def _of(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Messages of a topic, each with the time at which it was taken."""
         wanted = [each for each in self._bag.connections if each.topic == topic]
+        if not wanted:  # the package would take that for every topic
+            return
         for connection, logged_ns, data in self._bag.messages(connections=wanted):
             message = self._bag.deserialize(data, connection.msgtype)
             stamp = getattr(getattr(message, "header", None), "stamp", None)
@@ -188,7 +178,7 @@ class BagReader(DepthSource):
     def _choose(self, topic: str) -> str:
         if topic in self._bag.topics:
             return topic
-        images: list[str] = [n for n, t in self._bag.topics.items() if t.msgtype in (_IMAGE, _COMPRESSED)]
+        images = self._topics(_IMAGE, _COMPRESSED)
         if topic:
             there = ", ".join(images) or "none"
             raise SourceNotFoundError(f"'{self.uri}' has no topic '{topic}'; images: {there}.")
@@ -197,19 +187,33 @@ class BagReader(DepthSource):
         if len(found) == 1:
             return found[0]
         there = f"several: {', '.join(found)}" if found else f"none; images: {', '.join(images)}"
+        there = there.rstrip(": ")
         raise SourceNotFoundError(
-            f"'{self.uri}' has not one depth topic but {there.rstrip(': ')}; name one with --topic."
+            f"'{self.uri}' does not have exactly one depth topic but {there}; name one with --topic."
         )
 
+    def _topics(self, *types: str) -> list[str]:
+        return [name for name, topic in self._bag.topics.items() if topic.msgtype in types]
+
+    def _first(self, topic: str) -> Any:
+        """The first message of a topic, None if there is none."""
+        return next(self._of(topic), (0, None))[1]
+
+    def _kind(self, topic: str) -> str:
+        """What the images of a topic say that they are; empty if there are none."""
+        message = self._first(topic)
+        return str(getattr(message, "encoding", None) or getattr(message, "format", ""))
+
     def _is_depth(self, topic: str) -> bool:
-        _, message = next(self._of(topic), (0, None))
-        if message is None:
+        kind = self._kind(topic)
+        infrared = kind == "mono16" and "depth" not in topic.lower()
+        return not infrared and (kind in _RAW or "compressedDepth" in kind)
+
+    def _is_colour(self, topic: str) -> bool:
+        if any(part in topic.lower() for part in _INFRARED):
             return False
-        kind = getattr(message, "encoding", None) or message.format
-        # Infrared is mono16 too.
-        return (
-            kind in ("16UC1", "32FC1") or "compressedDepth" in kind or (kind == "mono16" and "depth" in topic.lower())
-        )
+        kind = self._kind(topic)
+        return kind in _COLOURS or "jp" in kind
 
     def _raw(self, message: Any) -> npt.NDArray[Any]:
         if hasattr(message, "format"):
@@ -220,39 +224,51 @@ class BagReader(DepthSource):
                 f"topic {self._topic} of '{self.uri}' holds {message.encoding}; depth is {', '.join(_RAW)}."
             )
         dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-        rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
-        across = rows[:, : message.width * dtype.itemsize]
-        return np.ascontiguousarray(across).view(dtype).astype(kind)
+        return _rows(message, dtype.itemsize).view(dtype).astype(kind)
 
     def _depth_unit(self, topic: str) -> float | None:
         """Values per metre, where RealSense's recorder has noted its unit."""
-        sensor = topic.partition("/Depth")[0]
-        name = f"{sensor}/option/Depth_Units/value"
-        _, message = next(self._of(name), (0, None)) if name in self._bag.topics else (0, None)
+        message = self._first(f"{topic.partition('/Depth')[0]}/option/Depth_Units/value")
         return round(1 / message.data, 3) if message is not None and message.data > 0 else None
 
     def _camera(self, shape: tuple[int, ...], given: tuple[float, ...] | None, time_ns: int) -> tuple[Camera, str]:
         height, width = shape
         if given is not None:
             return Camera(width, height, *given), "as given"
-        infos = [name for name, t in self._bag.topics.items() if t.msgtype == _CAMERA]
-        name = max(infos, key=lambda name: _shared(name, self._topic), default="")
-        if _shared(name, self._topic) > 1:
-            info = min(self._of(name), key=lambda item: abs(item[0] - time_ns))[1]
-            k = [float(each) for each in (info.K if hasattr(info, "K") else info.k)]
-            if (info.width, info.height) == (width, height) and k[0] > 0:
-                return Camera(width, height, float(k[0]), float(k[4]), float(k[2]), float(k[5])), name
+        name, size, told = self._info(self._topic, 2, time_ns)
+        if told and size == (width, height):
+            return Camera(width, height, *told), name
+        if name:
             self.notes += (
-                f"{name} is of images of {info.width}x{info.height} pixels, not {width}x{height};"
+                f"{name} describes images of {size[0]}x{size[1]} pixels, not {width}x{height};"
                 " it is not used. Give --camera fx,fy,cx,cy if you know them.",
             )
         return Camera.kinect(width, height), "assumed, a Kinect's"
 
+    def _info(self, topic: str, least: int, time_ns: int) -> tuple[str, tuple[int, int], tuple[float, ...] | None]:
+        """The CameraInfo whose name has most parts in common with a topic's, `least` or more, and nearest in time.
+
+        Returns its topic (empty if there is none), the images' width and height, and their
+        intrinsics where it tells any.
+        """
+        name = max(self._topics(_CAMERA), key=lambda name: _shared(name, topic), default="")
+        if _shared(name, topic) < least:
+            return "", (0, 0), None
+        info = min(self._of(name), key=lambda item: abs(item[0] - time_ns))[1]
+        k = [float(each) for each in (info.K if hasattr(info, "K") else info.k)]
+        return name, (info.width, info.height), (k[0], k[4], k[2], k[5]) if k[0] > 0 else None
+
+
+def _rows(message: Any, pixel_bytes: int) -> npt.NDArray[np.uint8]:
+    """The bytes of an image message, row by row, without what pads its rows."""
+    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
+    return np.ascontiguousarray(rows[:, : message.width * pixel_bytes])
+
 
 def _shared(one: str, other: str) -> int:
     """How many parts two topics' names have in common, from the first on."""
-    pairs = list(zip(one.split("/"), other.split("/"), strict=False))
-    return next((n for n, (a, b) in enumerate(pairs) if a != b), len(pairs))
+    pairs = zip(one.split("/"), other.split("/"), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def _decompress(data: bytes, kind: str) -> npt.NDArray[Any]:
@@ -260,7 +276,7 @@ def _decompress(data: bytes, kind: str) -> npt.NDArray[Any]:
     at = data.find(_PNG, 0, 64)
     raw = cv2.imdecode(np.frombuffer(data, np.uint8, offset=max(at, 0)), cv2.IMREAD_UNCHANGED)
     if at < 0 or raw is None or raw.dtype != np.uint16 or raw.ndim != 2:
-        raise SourceError(f"a message in the form '{kind}' holds no 16-bit PNG, which is read here.")
+        raise SourceError(f"a message in the format '{kind}' does not hold a 16-bit PNG; only those are read.")
     if "32FC1" not in kind:
         return raw
     near, far = (float(each) for each in np.frombuffer(data, "<f4", 2, 4))  # of inverse depth

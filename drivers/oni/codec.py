@@ -108,19 +108,16 @@ def encode_depth(depth_mm: _Depth, codec: bytes = CODEC_TABLE) -> bytes:
     return head + coded[:used].tobytes()
 
 
-def mend_order(payload: bytes, height: int, width: int) -> bytes | None:
-    """The ``16zT`` payload as OpenNI2 should have written it, None where it did.
+def is_swapped(payload: bytes, depth: _Depth) -> bool:
+    """Whether the flaw that is described above shows in the ``16zT`` payload of a frame.
 
-    Only where the flaw that is described above shows: in a run before a last pixel of another
-    depth. The mended payload has the same length, so it can be written in place.
+    That is in a run before a last pixel of another depth.
     """
     last, run = payload[-2:] if len(payload) > 4 else b"\0\0"
     if last & 0x0F != 0x0D or last >> 4 == 6 or not 0xE1 <= run <= 0xEF:
-        return None
-    depth_mm = decode_depth(CODEC_TABLE, payload, height, width)
-    mended = payload[:-2] + bytes((run, last))
+        return False
     # The two bytes may be parts of other codes.
-    return mended if depth_mm is not None and encode_depth(depth_mm) == mended else None
+    return encode_depth(depth) == payload[:-2] + bytes((run, last))
 
 
 @njit(cache=True, nogil=True)
@@ -204,13 +201,13 @@ def _encode(values: _Depth, coded: _Bytes) -> int:
     used, run, half = 2, 0, -1
     for value_ in values[1:]:
         value = _signed(value_)
-        step = last - value
+        difference = last - value
         last = value
-        if -6 <= step <= 6:
+        if -6 <= difference <= 6:
             if half < 0:
-                half = step + 6
+                half = difference + 6
                 continue
-            pair = half << 4 | (step + 6)
+            pair = half << 4 | (difference + 6)
             half = -1
             if pair == 0x66:
                 run += 1
@@ -229,8 +226,8 @@ def _encode(values: _Depth, coded: _Bytes) -> int:
         coded[used] = pair
         used += 1
         if pair & 0x0F == 0x0F:
-            if -63 <= step <= 63:
-                coded[used] = step + 192
+            if -63 <= difference <= 63:
+                coded[used] = difference + 192
                 used += 1
             else:
                 coded[used], coded[used + 1] = value >> 8, value & 0xFF

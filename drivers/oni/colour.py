@@ -51,7 +51,7 @@ class OniColour:
             kind = "JPEG" if node.codec == b"JPEG" else _KINDS.get(node.number_of("oniPixelFormat") or 200, "")
             if node.codec not in (b"JPEG", b"NONE") or not kind or 0 in mode[:2]:
                 codec = node.codec.decode("ascii", "replace")
-                self.unsupported = f"the colour of {node.name} ({codec}) is of a form that is not read"
+                self.unsupported = f"the colour of {node.name} ({codec}) has a format that is not read"
                 continue
             self.node, self._kind, self._size = node, kind, (int(mode[0]), int(mode[1]))
             with suppress(ValueError, ArithmeticError):

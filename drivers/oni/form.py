@@ -18,7 +18,7 @@ _MILLIMETRES, _TENTHS = 100, 101
 """OpenNI2's numbers of the pixel formats "depth in 1 mm" and "in 100 um"."""
 _SHIFTS: Final = {102: "9.2", 103: "9.3"}
 _LONGEST_GAP_US: Final = 1 << 40
-_USUAL_STEP_US: Final = 33_333
+_USUAL_INTERVAL_US: Final = 33_333
 
 
 def read_form(report: OniReport, depth: OniNode) -> None:
@@ -125,15 +125,15 @@ class Sides:
 
 def _changed(last: DepthArray, now: DepthArray) -> float:
     """Share of some pixels that differ by more than a twentieth, of those known in both frames."""
-    step = max(1, last.shape[1] // 160)
-    before, after = (each[::step, ::step].astype(np.int32) for each in (last, now))
+    stride = max(1, last.shape[1] // 160)
+    before, after = (each[::stride, ::stride].astype(np.int32) for each in (last, now))
     known = (before > 0) & (after > 0)
     return float((known & (np.abs(after - before) * 20 > before)).sum() / max(known.sum(), 1))
 
 
 def turned_at(number: int) -> str:
     """What is said of a recording that turns round at a frame."""
-    return f"turns into its mirror image at frame {number}; its frames are delivered on one side."
+    return f"turns into its mirror image at frame {number}; all its frames are delivered the same way round."
 
 
 def no_depth(nodes: Sequence[OniNode]) -> str:
@@ -156,11 +156,11 @@ def mended_times(times_us: list[int]) -> tuple[list[int], int | None]:
         before, now, after = times[at - 1] if at else times[1], times[at], times[at + 1]
         if not before <= now <= after and before <= after and (at or now > after):
             times[at] = (before + after) // 2 if at else after
-    steps = [after - before for before, after in pairwise(times)]
-    sound = [step for step in steps if 0 < step <= _LONGEST_GAP_US]
-    usual_us = round(median(sound)) if sound else _USUAL_STEP_US
+    intervals = [after - before for before, after in pairwise(times)]
+    sound = [interval for interval in intervals if 0 < interval <= _LONGEST_GAP_US]
+    usual_us = round(median(sound)) if sound else _USUAL_INTERVAL_US
     mended = times[:1] if times and abs(times[0]) < 1 << 61 else [0][: len(times)]
-    for step in steps:
-        mended.append(mended[-1] + (step if 0 <= step <= _LONGEST_GAP_US else usual_us))
+    for interval in intervals:
+        mended.append(mended[-1] + (interval if 0 <= interval <= _LONGEST_GAP_US else usual_us))
     differ = (n for n, time_us in enumerate(times_us) if mended[n] != time_us)
     return mended, next(differ, None)

@@ -130,8 +130,8 @@ class _Inspection:
             times_us, first = mended_times([frame.timestamp_us for frame in node.frames])
             if first is not None:
                 self.report.notes += (
-                    f"the clock of {node.name} jumps at frame {node.frames[first].number}; its times are delivered"
-                    " so that they go on rising, and --repair writes them so",
+                    f"the clock of {node.name} jumps at frame {node.frames[first].number}; its times are corrected"
+                    " so that they never run backwards, and --repair writes them so",
                 )
                 pairs = zip(node.frames, times_us, strict=True)
                 node.frames[:] = [replace(frame, timestamp_us=time_us) for frame, time_us in pairs]
@@ -152,7 +152,7 @@ class _Inspection:
             if OLDEST_VERSION <= tuple(version) <= VERSION:
                 self.report.version, self.report.old = number, tuple(version) < VERSION
                 if self.highest_node > _MAX_NODES:
-                    problem(20, f"the header tells of {self.highest_node} streams")
+                    problem(20, f"the header announces {self.highest_node} streams")
             else:
                 problem(4, f"version {number} of the format is not known, only up to 1.0.1.0")
         return bool(self.report.version)
@@ -327,7 +327,7 @@ class _Inspection:
             elif node.declared_frames != there and not node.changed:
                 self.problem(self.size, f"{node.declared_frames} {node.name} frames are announced, {there} are there")
             if node.seek_table_offset and node.declared_frames and not node.has_seek_table:
-                self.problem(self.size, f"there is no sound seek table of {node.name} at byte {node.seek_table_offset}")
+                self.problem(self.size, f"there is no valid seek table of {node.name} at byte {node.seek_table_offset}")
 
     def _decode_colour(self, deadline_s: float) -> None:
         """Drop the colour frames that cannot be decoded; note where none can be read."""
@@ -351,7 +351,7 @@ class _Inspection:
         Counts those that can, and of these those that the recorder swapped the last pixels of.
         """
         # Compiled code, whose import takes longer than a whole check without it.
-        from selective_depth.drivers.oni.codec import decode_depth, mend_order
+        from selective_depth.drivers.oni.codec import decode_depth, is_swapped
 
         report, sides, sound = self.report, Sides(), []
         size = camera.height, camera.width
@@ -363,7 +363,7 @@ class _Inspection:
                     self.problem(frame.record_offset, f"frame {frame.number} cannot be decoded")
                     continue
                 report.decoded_frames += 1
-                report.swapped_frames += depth.codec == CODEC_TABLE and mend_order(payload, *size) is not None
+                report.swapped_frames += depth.codec == CODEC_TABLE and is_swapped(payload, raw)
                 turns = sides.turns
                 sides.put_right(upright(raw, report.tenths, frame.mirrored))
                 if sides.turns > turns == 0:

@@ -168,8 +168,7 @@ class RecordWriter:
 class OniWriter:
     """Writes frames to an .oni file that OpenNI2 replays, depth bit by bit, colour as JPEG.
 
-    It holds colour if the first frame has any; `colourless` counts frames that have one where it
-    does not.
+    It holds colour if the first frame has any, and of a later one only an image of the same size.
 
     Parameters
     ----------
@@ -198,7 +197,6 @@ class OniWriter:
         self._first: DepthFrame | None = None
         self._first_us = 0
         self._colour_us: int | None = None
-        self.colourless = 0
         self._codec = CODEC_TABLE
         self._writer = RecordWriter(Path(path), keep=keep)
 
@@ -236,9 +234,8 @@ class OniWriter:
         self._writer.add_frame(1, since_us, payload)
 
     def _write_colour(self, first: DepthFrame, colour: ColourArray, time_us: int) -> None:
-        if first.colour is None or first.colour.shape != colour.shape:
-            self.colourless += 1
-        elif self._colour_us is None or time_us > self._colour_us:  # else it stands in the file already
+        fits = first.colour is not None and first.colour.shape == colour.shape
+        if fits and (self._colour_us is None or time_us > self._colour_us):  # else it stands in the file already
             self._colour_us = time_us
             self._writer.add_frame(2, time_us - self._first_us, jpeg_of(colour, JPEG_QUALITY))
 

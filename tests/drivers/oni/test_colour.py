@@ -130,7 +130,7 @@ def test_uncompressed_colour_of_other_recorders(
     with open_source(path) as source:
         frame = source.read()
         if encode is None:
-            assert frame.colour is None and "Image (NONE) is of a form that is not read" in source.notes[0]
+            assert frame.colour is None and "Image (NONE) has a format that is not read" in source.notes[0]
             return
     assert frame.colour is not None and not frame.registered  # nothing says so
     wanted = np.repeat(cv2.cvtColor(scene(5), cv2.COLOR_RGB2GRAY)[..., None], 3, 2) if form == 202 else scene(5)

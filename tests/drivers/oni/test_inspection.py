@@ -364,7 +364,7 @@ def test_timestamps_are_held_against_the_seek_table(recording: Path) -> None:
     [
         (0, b"RIFF", "begins with b'RIFF' instead of b'NI10'"),
         (4, b"\x09", r"version 9\.0\.1\.0"),
-        (20, b"\xff\xff\xff\xff", "tells of 4294967295 streams"),
+        (20, b"\xff\xff\xff\xff", "announces 4294967295 streams"),
         (24, b"X", "must begin with 'NIR'"),
         (28, b"\x63", "no record of kind 99"),
         (36, b"\xff\xff\xff\x7f", "cannot have 2147483647 bytes of header"),
@@ -376,7 +376,7 @@ def test_timestamps_are_held_against_the_seek_table(recording: Path) -> None:
         (62, b"\x09", "no depth stream"),
         (66, b"zz", "compression b'zz"),
         (70, b"\x63", "99 Depth frames are announced, 6 are there"),
-        (90, b"\xff", "no sound seek table"),
+        (90, b"\xff", "no valid seek table"),
     ],
 )
 def test_every_wrong_number_is_found_and_named(recording: Path, place: int, value: bytes, sentence: str) -> None:
