@@ -21,7 +21,7 @@ from selective_depth.app.pipeline import Feed, open_and_tell, say
 from selective_depth.drivers.errors import SourceError
 from selective_depth.drivers.folder import FolderWriter
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.oni import OniReport, OniWriter, export_oni, inspect_oni, repair_oni
+from selective_depth.drivers.oni import OniReader, OniReport, OniWriter, inspect_oni, repair_oni
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.options import parted
 from selective_depth.drivers.search import FILES
@@ -174,8 +174,8 @@ def _export(source: str, out: Path, frames: int | None, progress: FrameProgress)
     if recording and to_oni and frames is None:
         count = repair_oni(source, out).readable_frames
     elif recording and not to_oni and ending not in BAGS:
-        readable = export_oni(source, out, progress.update, frames=frames).readable_frames
-        count = readable if frames is None else min(readable, frames)
+        with OniReader(source, salvage=True) as recorded:
+            count = _save(recorded, out, frames, progress)
     else:
         with open_and_tell(source) as opened:
             for note in opened.notes:

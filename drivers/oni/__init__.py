@@ -3,17 +3,8 @@
 from selective_depth.drivers.oni.inspection import inspect_oni
 from selective_depth.drivers.oni.reader import OniReader
 from selective_depth.drivers.oni.recorder import OniRecorder, check_place
-from selective_depth.drivers.oni.repair import export_oni, repair_oni
+from selective_depth.drivers.oni.repair import repair_oni
 from selective_depth.drivers.oni.report import OniReport
 from selective_depth.drivers.oni.writer import OniWriter
 
-__all__ = [
-    "OniReader",
-    "OniRecorder",
-    "OniReport",
-    "OniWriter",
-    "check_place",
-    "export_oni",
-    "inspect_oni",
-    "repair_oni",
-]
+__all__ = ["OniReader", "OniRecorder", "OniReport", "OniWriter", "check_place", "inspect_oni", "repair_oni"]

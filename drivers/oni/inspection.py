@@ -7,6 +7,7 @@ player would rely on, before it gets to see the file.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from selective_depth.drivers.errors import SourceNotFoundError
+from selective_depth.drivers.errors import DamagedRecordingError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera
 from selective_depth.drivers.oni.files import open_regular, read_payload, skip_hole, unreadable
 from selective_depth.drivers.oni.form import Sides, mended_times, no_depth, read_form, turned_at, upright
@@ -79,6 +80,23 @@ def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10
             return _Inspection(path, file).report_on(stream, decode, timeout_s)
         except OSError as error:
             raise unreadable(path, error) from error
+
+
+def rescuable(path: str | Path, stream: int = 1) -> OniReport:
+    """The report of a file of which something can be saved, every frame decoded, however long that takes.
+
+    Raises
+    ------
+    SourceNotFoundError
+        As for `inspect_oni`.
+    DamagedRecordingError
+        If no depth frame can be read.
+    """
+    report = inspect_oni(path, decode=True, timeout_s=math.inf, stream=stream)
+    if report.readable_frames == 0 or report.camera is None:
+        why = f" ({report.problems[0]})" if report.problems else ""
+        raise DamagedRecordingError(f"nothing can be saved of '{path}': no depth frame in it is readable{why}.")
+    return report
 
 
 class _Inspection:

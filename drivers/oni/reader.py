@@ -12,7 +12,7 @@ from selective_depth.drivers.oni.codec import decode_depth
 from selective_depth.drivers.oni.colour import OniColour
 from selective_depth.drivers.oni.files import open_regular, read_payload
 from selective_depth.drivers.oni.form import Sides, turned_at, upright
-from selective_depth.drivers.oni.inspection import inspect_oni
+from selective_depth.drivers.oni.inspection import inspect_oni, rescuable
 from selective_depth.drivers.oni.nodes import OniFrame
 from selective_depth.drivers.oni.report import OniReport
 from selective_depth.drivers.source import DepthSource
@@ -35,6 +35,8 @@ class OniReader(DepthSource):
         fx, fy, cx, cy in pixels; default as recorded, or from the recorded field of view.
     colouring : Colouring, optional
         What is known of its colour; default what is recorded.
+    salvage : bool, default False
+        Deliver what can be decoded beyond damage too. All of it is decoded first to find out.
 
     Attributes
     ----------
@@ -58,9 +60,10 @@ class OniReader(DepthSource):
         stream: int = 1,
         intrinsics: tuple[float, ...] | None = None,
         colouring: Colouring = ON,
+        salvage: bool = False,
     ) -> None:
         self.uri = str(path)
-        self.report = inspect_oni(path, stream=stream)
+        self.report = rescuable(path, stream) if salvage else inspect_oni(path, stream=stream)
         self.dropped = 0
         if self.report.unsupported:
             raise SourceError(f"'{path}' cannot be read: {self.report.unsupported}.")
@@ -72,7 +75,7 @@ class OniReader(DepthSource):
         if self.report.damage is not None:
             self.damage = self.notes[0]
         self.notes += tuple(f"'{path}': {note}." for note in self.report.notes)
-        self._frames, self._damage = _trusted_frames(self.report)
+        self._frames, self._damage = (self.report.frames, None) if salvage else _trusted_frames(self.report)
         if self._damage is not None and not self._frames:
             raise DamagedRecordingError(self._sentence(self._damage))
         if not self._frames or self.report.depth is None or self.report.camera is None:

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from itertools import islice
+import math
 from pathlib import Path
 
-from selective_depth.drivers.colour import ON
-from selective_depth.drivers.errors import DamagedRecordingError
-from selective_depth.drivers.folder import FolderWriter
-from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni.codec import encode_depth
-from selective_depth.drivers.oni.colour import OniColour
 from selective_depth.drivers.oni.files import open_regular, read_payload
-from selective_depth.drivers.oni.inspection import inspect_oni
+from selective_depth.drivers.oni.inspection import inspect_oni, rescuable
 from selective_depth.drivers.oni.nodes import OniNode, in_file_order
 from selective_depth.drivers.oni.reader import read_depth
 from selective_depth.drivers.oni.records import CODEC_NONE, CODEC_TABLE, CODECS
@@ -50,7 +44,7 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
     OutputError
         If the new file exists or cannot be written.
     """
-    report = _rescuable(path)
+    report = rescuable(path)
     assert report.depth is not None and report.camera is not None
     defaults = depth_properties(report.camera, report.fps)
     kept = [node for node in report.nodes if not node.is_stream or (node.ready and node.codec in CODECS)]
@@ -73,58 +67,4 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
                 writer.add_frame(node.number, frame.timestamp_us, payload)
         finally:
             writer.close()
-    return inspect_oni(out_path, decode=True, timeout_s=float("inf"))
-
-
-def export_oni(
-    path: str | Path, folder: str | Path, progress: Callable[[int], None] | None = None, *, frames: int | None = None
-) -> OniReport:
-    """Save every readable depth frame of an .oni file, damaged or not, as a folder of PNG files.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    folder : str or Path
-        The folder; made if it is not there. It must not hold PNG files yet.
-    progress : callable, optional
-        Called with the number of frames saved so far.
-    frames : int, optional
-        Save only so many, the first ones.
-
-    Returns
-    -------
-    OniReport
-        Of the .oni file; its `readable_frames`, or the first of them, were saved.
-
-    Raises
-    ------
-    SourceNotFoundError
-        If there is no such file.
-    DamagedRecordingError
-        If no depth frame can be read.
-    OutputError
-        If the folder cannot be written.
-    """
-    report = _rescuable(path)
-    depth, camera = report.depth, report.camera
-    assert depth is not None and camera is not None
-    colour = OniColour(report.nodes)
-    with open_regular(report.path) as file, FolderWriter(folder, fps=report.fps) as out:
-        for index, frame in enumerate(islice(depth.frames, frames)):
-            depth_mm = read_depth(report, file, frame)
-            if depth_mm is None:
-                raise DamagedRecordingError(f"'{path}' has changed while it was read.")
-            whole = DepthFrame(depth_mm, index, frame.timestamp_us, camera, str(path))
-            out.write(colour.on(file, whole, ON))
-            if progress is not None:
-                progress(index + 1)
-    return report
-
-
-def _rescuable(path: str | Path) -> OniReport:
-    report = inspect_oni(path, decode=True, timeout_s=float("inf"))
-    if report.readable_frames == 0 or report.camera is None:
-        why = f" ({report.problems[0]})" if report.problems else ""
-        raise DamagedRecordingError(f"nothing can be saved of '{path}': no depth frame in it is readable{why}.")
-    return report
+    return inspect_oni(out_path, decode=True, timeout_s=math.inf)

@@ -13,7 +13,7 @@ from oni_layouts import write_oni
 
 from selective_depth.drivers import DepthFrame, open_source
 from selective_depth.drivers.frame import Camera
-from selective_depth.drivers.oni import export_oni, inspect_oni, repair_oni
+from selective_depth.drivers.oni import OniReader, inspect_oni, repair_oni
 from selective_depth.drivers.oni.nodes import OniNode, integer, structure
 from selective_depth.drivers.oni.records import NodeType
 from selective_depth.drivers.oni.writer import RecordWriter, depth_properties
@@ -97,8 +97,7 @@ def test_a_damaged_image_is_found_left_out_and_repaired(tmp_path: Path) -> None:
     assert seen == [False, False, True, False]
     assert repair_oni(path, mended).complete
     assert [len(node.frames) for node in inspect_oni(mended).nodes] == [4, 3]
-    export_oni(path, tmp_path / "folder")
-    with open_source(tmp_path / "folder") as source:
+    with OniReader(path, salvage=True) as source:
         assert [frame.colour is None for frame in source] == seen
 
 

@@ -21,9 +21,8 @@ from raw_oni_player import digest_of, play_all
 from virtual_sensor import record_oni
 
 from selective_depth.drivers.errors import DamagedRecordingError, OutputError, SourceEndedError, SourceNotFoundError
-from selective_depth.drivers.folder import RecordedFolder
 from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.drivers.oni import OniReader, OniReport, export_oni, inspect_oni, repair_oni
+from selective_depth.drivers.oni import OniReader, OniReport, inspect_oni, repair_oni
 from selective_depth.drivers.oni.codec import encode_depth
 from selective_depth.drivers.oni.inspection import _Inspection
 from selective_depth.drivers.oni.nodes import OniNode, integer, structure
@@ -309,10 +308,10 @@ def test_frames_around_a_damaged_one_are_saved(recording: Path, tmp_path: Path) 
     kept = [frame for frame in _frames() if frame.index not in (2, 4)]
     repair_oni(recording, tmp_path / "out.oni")
     _assert_same(_read(tmp_path / "out.oni"), kept)
-    export_oni(recording, tmp_path / "folder")
-    with RecordedFolder(tmp_path / "folder") as folder:
-        _assert_same(list(folder), kept)
-        assert folder.camera == inspect_oni(recording).camera
+    with OniReader(recording, salvage=True) as reader:
+        assert reader.frame_count == len(kept)
+        _assert_same(list(reader), kept)
+        assert reader.camera == inspect_oni(recording).camera
 
 
 def test_a_frame_that_cannot_be_decoded_ends_the_replay_with_its_place(recording: Path) -> None:
