@@ -30,15 +30,11 @@ class PlayedSource(DepthSource):
         If it has no frame `start`.
     """
 
-    live = False
-    dropped = 0
-
     def __init__(
         self, source: DepthSource, again: Callable[[], DepthSource] | None = None, *, start: int = 0, every: int = 1
     ) -> None:
         self._source, self._again, self._start, self._every = source, again, start, every
         self.uri, self.camera, self.fps, self.about = source.uri, source.camera, source.fps / every, source.about
-        self.frame_count = None
         self.state = "replay"
         if again is None and source.frame_count is not None:
             self.frame_count = max(0, -(-(source.frame_count - start) // every))

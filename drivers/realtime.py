@@ -34,21 +34,21 @@ class RealtimeSource(DepthSource):
         self.frame_count = source.frame_count
         self.notes = source.notes
         self.state = source.state
-        self.dropped = 0
         self._changed = threading.Condition()
         self._newest: DepthFrame | None = None
         self._end: Exception | None = None
         self._closing = threading.Event()
-        self._first_taken = self._asked_again = False
+        self._first_taken = False
+        self._asked_again = threading.Event()
         self._thread = threading.Thread(target=self._play, name="realtime", daemon=True)
         self._thread.start()
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         """Return the newest frame that has not been read; see `DepthSource.read`."""
         self.check_process()
+        if self._first_taken:
+            self._asked_again.set()
         with self._changed:
-            self._asked_again = self._first_taken
-            self._changed.notify_all()
             self._changed.wait_for(lambda: self._newest or self._end, timeout_s)
             if self._newest is not None:
                 frame, self._newest = self._newest, None
@@ -60,9 +60,8 @@ class RealtimeSource(DepthSource):
 
     def close(self) -> None:
         """Stop playing and close the recording."""
-        with self._changed:
-            self._closing.set()
-            self._changed.notify_all()
+        self._closing.set()
+        self._asked_again.set()
         self._thread.join()
         self._source.close()
 
@@ -70,8 +69,7 @@ class RealtimeSource(DepthSource):
         try:
             first = self._source.read()
             self._hand_over(first)
-            with self._changed:
-                self._changed.wait_for(lambda: self._asked_again or self._closing.is_set())
+            self._asked_again.wait()
             start_s = time.perf_counter()
             while not self._closing.is_set():
                 frame = self._source.read()

@@ -47,9 +47,9 @@ class DepthSource(ABC):
     uri: str
     camera: Camera
     fps: float
-    frame_count: int | None
-    live: bool
-    dropped: int
+    frame_count: int | None = None
+    live: bool = False
+    dropped: int = 0
     state: str = "live"
     about: str = ""
     notes: tuple[str, ...] = ()

@@ -63,8 +63,6 @@ class BagReader(DepthSource):
         If rosbags is not installed.
     """
 
-    live = False
-
     def __init__(
         self,
         path: str | Path,
@@ -76,7 +74,7 @@ class BagReader(DepthSource):
     ) -> None:
         self.uri = str(path)
         self.path = Path(path)
-        self.dropped = self._next = 0
+        self._next = 0
         self._bag: Any = None
         highlevel, types = rosbags("highlevel"), rosbags("typesys")
         try:

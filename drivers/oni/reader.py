@@ -51,8 +51,6 @@ class OniReader(DepthSource):
         If it is no recording, or no frame comes before the damage.
     """
 
-    live = False
-
     def __init__(
         self,
         path: str | Path,
@@ -64,7 +62,6 @@ class OniReader(DepthSource):
     ) -> None:
         self.uri = str(path)
         self.report = rescuable(path, stream) if salvage else inspect_oni(path, stream=stream)
-        self.dropped = 0
         if self.report.unsupported:
             raise SourceError(f"'{path}' cannot be read: {self.report.unsupported}.")
         if self.report.problems:
