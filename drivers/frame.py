@@ -77,14 +77,8 @@ class Camera:
         for fov in (fov_x_rad, fov_y_rad):
             if not 0 < fov < math.pi:
                 raise ValueError(f"field of view is {fov} rad; it must lie between 0 and pi")
-        return cls(
-            width=width,
-            height=height,
-            fx=width / (2 * math.tan(fov_x_rad / 2)),
-            fy=height / (2 * math.tan(fov_y_rad / 2)),
-            cx=width / 2,
-            cy=height / 2,
-        )
+        fx, fy = width / (2 * math.tan(fov_x_rad / 2)), height / (2 * math.tan(fov_y_rad / 2))
+        return cls(width, height, fx, fy, width / 2, height / 2)
 
     @classmethod
     def kinect(cls, width: int = 640, height: int = 480) -> Camera:

@@ -35,6 +35,7 @@ from selective_depth.drivers.oni.records import (
     SEEK_ENTRY,
     UNKNOWN_COUNT,
     VERSION,
+    CutError,
     Kind,
     NodeType,
     Record,
@@ -183,7 +184,7 @@ class _Inspection:
             except RecordError as error:
                 found = self._next_record(offset + 1)
                 # A recorder that was stopped leaves half a record at the very end.
-                self.problem(offset, f"{error}", harmless=found is None and self._cut(error))
+                self.problem(offset, f"{error}", harmless=found is None and isinstance(error, CutError))
                 if found is None:
                     break
                 offset = found
@@ -210,10 +211,6 @@ class _Inspection:
             except RecordError:
                 return  # zeros, as a rule; a table that is needed is missed later
             self.report.end_offset = offset = record.end
-
-    @staticmethod
-    def _cut(error: RecordError) -> bool:
-        return str(error).startswith("the file ends")
 
     def _next_record(self, offset: int) -> int | None:
         """Offset of the next sound record at or after an offset, None if there is none."""
@@ -303,10 +300,10 @@ class _Inspection:
             raise RecordError(f"node {node.number} was not ready for frames")
         if node.changed:
             return  # what comes now is of another size or unit
-        last = node.frames[-1] if node.frames else None
-        if number != (last.number if last else 0) + 1:
-            self.problem(record.offset, f"frame {number} follows frame {last.number if last else 0} of {node.name}")
-            if last is not None and number <= last.number:
+        previous = node.frames[-1].number if node.frames else 0
+        if number != previous + 1:
+            self.problem(record.offset, f"frame {number} follows frame {previous} of {node.name}")
+            if node.frames and number <= previous:
                 return
         if timestamp_us > self.latest_us:
             self.problem(record.offset, f"frame {number} is later than the recording's end")

@@ -86,17 +86,13 @@ class OniNode:
         form = {Kind.NODE_ADDED_4: "<I4s", Kind.NODE_ADDED_5: "<I4sIQQ"}.get(record.kind, newest)
         if len(rest) != struct.calcsize(form):
             raise RecordError(f"its fields after the name have {len(rest)} bytes instead of {struct.calcsize(form)}")
-        fields = struct.unpack(form, rest)
-        count = fields[2] if len(fields) > 2 else UNKNOWN_COUNT
-        return cls(
-            record.node,
-            name,
-            node_type=fields[0],
-            codec=fields[1],
-            declared_frames=None if count == UNKNOWN_COUNT else count,
-            seek_table_offset=fields[5] if len(fields) > 5 else 0,
-            offset=record.offset,
-        )
+        node_type, codec, *more = struct.unpack(form, rest)
+        node = cls(record.node, name, node_type, codec, offset=record.offset)
+        if more and more[0] != UNKNOWN_COUNT:
+            node.declared_frames = more[0]
+        if len(more) > 3:
+            node.seek_table_offset = more[3]
+        return node
 
     def addition(self) -> bytes:
         """Fields of its NODE_ADDED record in the current version."""

@@ -87,6 +87,10 @@ class RecordError(ValueError):
     """A record breaks the format; the message is a clause saying how."""
 
 
+class CutError(RecordError):
+    """The file ends inside a record."""
+
+
 @dataclass(frozen=True, slots=True)
 class Record:
     """One record; its payload stays in the file."""
@@ -117,7 +121,7 @@ def read_record(file: BinaryIO, offset: int, size: int, old: bool) -> Record:
     file.seek(offset)
     start = file.read(256)  # holds nearly every record's fields as well
     if len(start) < form.size:
-        raise RecordError(f"the file ends inside a record header, at byte {offset + len(start)}")
+        raise CutError(f"the file ends inside a record header, at byte {offset + len(start)}")
     magic, number, node, fields_end, payload_size, undone_offset = form.unpack_from(start)
     if magic != MAGIC:
         raise RecordError(f"a record must begin with 'NIR', found {magic!r}")
@@ -134,7 +138,7 @@ def read_record(file: BinaryIO, offset: int, size: int, old: bool) -> Record:
     payload_offset = offset + fields_end
     if len(start) < fields_end or payload_offset + payload_size > size:
         missing = payload_offset + payload_size - size
-        raise RecordError(f"the file ends inside a {kind.name} record, {missing} bytes too early")
+        raise CutError(f"the file ends inside a {kind.name} record, {missing} bytes too early")
     fields = start[form.size : fields_end]
     return Record(offset, kind, node, fields, payload_offset, payload_size, undone_offset)
 
