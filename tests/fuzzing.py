@@ -113,9 +113,8 @@ def _written(write: Callable[[Path], object]) -> Files:
 
 
 def _oni_inputs() -> list[Files]:
-    from oni_layouts import write_oni
-
     from selective_depth.drivers.frame import Camera, DepthFrame
+    from selective_depth.drivers.oni import write_oni
 
     made = []
     for colour in (None, np.zeros((12, 16, 3), np.uint8)):

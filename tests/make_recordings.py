@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from oni_layouts import write_oni
 
 from selective_depth.drivers.folder import write_folder
+from selective_depth.drivers.oni import write_oni
 from selective_depth.drivers.open import open_source
 
 RECORDINGS = Path(__file__).parent.parent / "recordings"

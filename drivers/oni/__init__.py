@@ -5,6 +5,15 @@ from selective_depth.drivers.oni.reader import OniReader
 from selective_depth.drivers.oni.recorder import OniRecorder, check_place
 from selective_depth.drivers.oni.repair import repair_oni
 from selective_depth.drivers.oni.report import OniReport
-from selective_depth.drivers.oni.writer import OniWriter
+from selective_depth.drivers.oni.writer import OniWriter, write_oni
 
-__all__ = ["OniReader", "OniRecorder", "OniReport", "OniWriter", "check_place", "inspect_oni", "repair_oni"]
+__all__ = [
+    "OniReader",
+    "OniRecorder",
+    "OniReport",
+    "OniWriter",
+    "check_place",
+    "inspect_oni",
+    "repair_oni",
+    "write_oni",
+]

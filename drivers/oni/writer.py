@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -42,12 +42,14 @@ from selective_depth.drivers.oni.records import (
     pack_property,
     pack_record,
 )
+from selective_depth.drivers.source import DepthSource
 
 _MAX_DEPTH_MM: Final = 65535
 _DEPTH_1_MM: Final = 100  # OpenNI2's number of this pixel format
 _GREY_16_BIT: Final = 4  # and OpenNI 1's
 _RGB_888: Final = 200
 _RGB_24_BIT: Final = 1
+_DEFAULT_FPS: Final = 30.0
 JPEG_QUALITY: Final = 92
 """Of recorded colour: it is off by less than its sensor's noise."""
 
@@ -191,7 +193,7 @@ class OniWriter:
     more different depths than that can say: then the file is written anew without.
     """
 
-    def __init__(self, path: str | Path, *, fps: float = 30.0, keep: bool = False) -> None:
+    def __init__(self, path: str | Path, *, fps: float = _DEFAULT_FPS, keep: bool = False) -> None:
         self._fps = fps
         self._keep = keep
         self._first: DepthFrame | None = None
@@ -302,6 +304,38 @@ class OniWriter:
                     self._writer.add_frame(node.number, frame.timestamp_us, payload)
         finally:
             compressed.unlink(missing_ok=True)
+
+
+def write_oni(path: str | Path, frames: Iterable[DepthFrame], *, fps: float | None = None) -> int:
+    """Save frames as an .oni file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; must not exist.
+    frames : iterable of DepthFrame
+        All of one camera; an open `DepthSource` is one.
+    fps : float, optional
+        Nominal frame rate; default that of the source, or 30.
+
+    Returns
+    -------
+    int
+        Number of frames written.
+
+    Raises
+    ------
+    OutputError
+        If the file exists or cannot be written.
+    """
+    if fps is None:
+        fps = frames.fps if isinstance(frames, DepthSource) else _DEFAULT_FPS
+    count = 0
+    with OniWriter(path, fps=fps) as recording:
+        for frame in frames:
+            recording.write(frame)
+            count += 1
+    return count
 
 
 def depth_properties(camera: Camera, fps: float) -> dict[str, Property]:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT
-from oni_layouts import write_oni
 
 from selective_depth.app.cli import run
 from selective_depth.app.commands.files import export
@@ -15,7 +14,7 @@ from selective_depth.app.console.errors import UsageError
 from selective_depth.drivers.folder import RecordedFolder, write_folder
 from selective_depth.drivers.folder.images import write_png
 from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.drivers.oni import OniReader, inspect_oni
+from selective_depth.drivers.oni import OniReader, inspect_oni, write_oni
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.source import DepthSource
 

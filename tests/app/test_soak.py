@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from conftest import ROOT
-from oni_layouts import write_oni
 from rerun_listener import Listener
 from virtual_sensor import VirtualSensor
 
@@ -23,6 +22,7 @@ from selective_depth.app.commands import session as session_module
 from selective_depth.app.commands.session import Session
 from selective_depth.app.settings import AcquireOptions, RunOptions, Settings, ViewerOptions
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.oni import write_oni
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.source import DepthSource
 

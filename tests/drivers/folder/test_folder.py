@@ -14,7 +14,6 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oni_layouts import write_oni
 
 from selective_depth.drivers.errors import (
     DamagedRecordingError,
@@ -27,6 +26,7 @@ from selective_depth.drivers.folder import FolderWriter, RecordedFolder, write_f
 from selective_depth.drivers.folder.images import read_png
 from selective_depth.drivers.folder.sidecar import SIDECAR, Sidecar, read_sidecar, write_sidecar
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.oni import write_oni
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.realtime import RealtimeSource
 

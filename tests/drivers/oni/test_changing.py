@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from oni_layouts import write_oni
 
 from selective_depth.drivers import DepthFrame, open_source
 from selective_depth.drivers.errors import DamagedRecordingError
 from selective_depth.drivers.frame import Camera
-from selective_depth.drivers.oni import OniWriter
+from selective_depth.drivers.oni import OniWriter, write_oni
 
 CAMERA = Camera.kinect(64, 48)
 

@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
-from oni_layouts import write_oni
 
 from selective_depth.drivers import DepthFrame, open_source
 from selective_depth.drivers.frame import Camera
-from selective_depth.drivers.oni import OniReader, inspect_oni, repair_oni
+from selective_depth.drivers.oni import OniReader, inspect_oni, repair_oni, write_oni
 from selective_depth.drivers.oni.nodes import OniNode, integer, structure
 from selective_depth.drivers.oni.records import NodeType
 from selective_depth.drivers.oni.writer import RecordWriter, depth_properties

@@ -15,14 +15,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from conftest import OniSample
-from oni_layouts import write_oni
 from oni_mutations import cuts, mutations
 from raw_oni_player import digest_of, play_all
 from virtual_sensor import record_oni
 
 from selective_depth.drivers.errors import DamagedRecordingError, OutputError, SourceEndedError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.drivers.oni import OniReader, OniReport, inspect_oni, repair_oni
+from selective_depth.drivers.oni import OniReader, OniReport, inspect_oni, repair_oni, write_oni
 from selective_depth.drivers.oni.codec import encode_depth
 from selective_depth.drivers.oni.inspection import _Inspection
 from selective_depth.drivers.oni.nodes import OniNode, integer, structure

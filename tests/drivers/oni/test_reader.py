@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT, OniSample
-from oni_layouts import write_oni, write_uncompressed
+from oni_layouts import write_uncompressed
 from raw_oni_player import digest_of, play_all
 
 from selective_depth.drivers.errors import DamagedRecordingError, SourceEndedError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.drivers.oni import OniReader, inspect_oni
+from selective_depth.drivers.oni import OniReader, inspect_oni, write_oni
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.openni.runtime import find_runtime
 

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from oni_layouts import write_oni
 from virtual_sensor import VirtualSensor
 
 from selective_depth.app import cli
 from selective_depth.drivers.errors import DeviceLostError, DeviceRefusedError, SourceNotFoundError, SourceTimeoutError
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.oni import write_oni
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.openni import DeviceSettings, OpenNIDevice, record
 from selective_depth.drivers.openni.runtime import Runtime
