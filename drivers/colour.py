@@ -69,7 +69,7 @@ def rgb_of(data: Any, kind: str, width: int, height: int) -> ColourArray | None:
 
 
 def rgb_of_file(file: Path | io.BytesIO) -> ColourArray | None:
-    """The image of a file; None if it is none, damaged or larger than `MOST_PIXELS`.
+    """The image of a file; None if it is not an image, damaged or larger than `MOST_PIXELS`.
 
     Pillow reads it: OpenCV's decoders print on standard error what they find damaged.
     """

@@ -56,7 +56,7 @@ class BagReader(DepthSource):
     Raises
     ------
     SourceNotFoundError
-        If there is no such topic, or no one depth topic.
+        If there is no such topic, or not exactly one depth topic.
     DamagedRecordingError
         If the bag cannot be read.
     SourceError

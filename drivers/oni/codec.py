@@ -128,7 +128,7 @@ def _signed(value: np.integer) -> int:
 
 @njit(cache=True, nogil=True)
 def _decode(coded: _Bytes, table: _Depth, depth: _Depth) -> bool:
-    """Fill `depth` from `coded`; False if it does not fit exactly. An empty table is no table."""
+    """Fill `depth` from `coded`; False if it does not fit exactly. An empty `table` means that there is none."""
     end = coded.size
     pixels = depth.size
     entries = table.size if table.size > 0 else 65536

@@ -18,7 +18,7 @@ def open_regular(path: Path) -> BinaryIO:
     Raises
     ------
     SourceNotFoundError
-        If there is no such file, it is no regular file (a folder, a pipe, a device) or cannot be
+        If there is no such file, it is not a regular file (a folder, a pipe, a device) or cannot be
         opened.
     """
     try:

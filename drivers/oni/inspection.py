@@ -72,7 +72,7 @@ def inspect_oni(path: str | Path, *, decode: bool = False, timeout_s: float = 10
     Raises
     ------
     SourceNotFoundError
-        If there is no such file, it is no regular file (a folder, a pipe, a device) or cannot be
+        If there is no such file, it is not a regular file (a folder, a pipe, a device) or cannot be
         read.
     """
     path = Path(path)
@@ -94,7 +94,7 @@ def rescuable(path: str | Path, stream: int = 1) -> OniReport:
         If no depth frame can be read.
     """
     report = inspect_oni(path, decode=True, timeout_s=math.inf, stream=stream)
-    if report.readable_frames == 0 or report.camera is None:
+    if report.readable_frames == 0:
         why = f" ({report.problems[0]})" if report.problems else ""
         raise DamagedRecordingError(f"nothing can be saved of '{path}': no depth frame in it is readable{why}.")
     return report

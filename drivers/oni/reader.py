@@ -48,7 +48,7 @@ class OniReader(DepthSource):
     SourceNotFoundError
         If there is no such file.
     DamagedRecordingError
-        If it is no recording, or no frame comes before the damage.
+        If it is not a recording, or no frame comes before the damage.
     """
 
     def __init__(

@@ -151,7 +151,7 @@ def pack_record(kind: Kind, node: int, fields: bytes = b"", payload: bytes = b""
 
 
 def unpack_fields(record: Record, form: struct.Struct) -> tuple[int, ...]:
-    """The fields of a record that has no others than numbers.
+    """The fields of a record that has only numbers.
 
     Raises
     ------
