@@ -5,23 +5,17 @@ from __future__ import annotations
 import json
 import os
 import platform
-import tempfile
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import partial
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
-
-from selective_depth.app.benchmark.loads import Load, run_loads
+from selective_depth.app.benchmark.loads import Load, run_loads, run_once
 from selective_depth.app.benchmark.peers import peer_seconds
-from selective_depth.app.commands.session import Session
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.pipeline import RunReport, StageSummary, open_and_tell
-from selective_depth.app.settings import PlayOptions, RunOptions, Settings, ViewerOptions
+from selective_depth.app.pipeline import StageSummary, StageTimes, open_and_tell
+from selective_depth.app.settings import PlayOptions, Settings
 from selective_depth.selectors.improvement import ImprovementSelector
 from selective_depth.selectors.neural_gas import BatchNeuralGas, delaunay_regions, node_pixels, train_exact
 from selective_depth.selectors.parallel import default_threads
@@ -33,8 +27,6 @@ EXACT_FRAMES = 3
 WARM_UP = 10
 
 Say = Callable[[str], None]
-Durations = dict[str, list[float]]
-"""Milliseconds of every run of a stage, by the stage's name."""
 SCHEMA = 1
 """Version of the JSON's keys."""
 
@@ -92,12 +84,6 @@ def machine() -> dict[str, str]:
     }
 
 
-def summarise(durations_ms: list[float]) -> StageSummary:
-    """Median, 99th percentile and maximum of a stage's runs."""
-    p50, p99 = np.percentile(durations_ms, (50, 99))
-    return StageSummary(float(p50), float(p99), max(durations_ms), len(durations_ms))
-
-
 def bench(source: str, frames: int | None = None, *, peers: bool = True, say: Say = lambda text: None) -> BenchReport:
     """Time every stage over the frames of a source, one after the other.
 
@@ -114,15 +100,13 @@ def bench(source: str, frames: int | None = None, *, peers: bool = True, say: Sa
     """
     say("reading the frames")
     seeds = _seeds_of(source, frames)
-    durations: Durations = {}
-    _time_improvement(seeds, durations, say)
-    _time_neural_gas(seeds, durations, say)
+    times = StageTimes()
+    _time_improvement(seeds, times, say)
+    _time_neural_gas(seeds, times, say)
     say("the whole loop in real time, both selectors, saving for Rerun")
-    report = _whole_loop(source, frames)
+    report = run_once(source, Settings(play=PlayOptions(realtime=True)), frames)
     loads = run_loads(source, frames, say)
     say("peers" if peers else "done")
-    measured = {name: summarise(each) for name, each in durations.items()}
-    measured |= {"log": report.stages["log"], "loop": report.stages["loop"]}
     return BenchReport(
         source=Path(source).name or source,
         frames=report.frames,
@@ -130,7 +114,7 @@ def bench(source: str, frames: int | None = None, *, peers: bool = True, say: Sa
         fps=report.fps,
         threads=default_threads(),
         machine=machine(),
-        stages=measured,
+        stages=times.summary() | {name: report.stages[name] for name in ("log", "loop")},
         peers=peer_seconds(seeds[0], NODES, EPOCHS) if peers else {},
         loads=loads,
     )
@@ -143,51 +127,38 @@ def _seeds_of(source: str, frames: int | None) -> list[SeedGrid]:
         return [SeedGrid.from_frame(frame) for frame in islice(opened, frames)]
 
 
-def _timed(durations: Durations, name: str, calls: Iterable[Callable[[], object]]) -> None:
-    for call in calls:
-        start = time.perf_counter()
-        call()
-        durations.setdefault(name, []).append((time.perf_counter() - start) * 1000)
-
-
-def _time_improvement(seeds: list[SeedGrid], durations: Durations, say: Say) -> None:
+def _time_improvement(seeds: list[SeedGrid], times: StageTimes, say: Say) -> None:
     for name, threads in (("improvement", None), ("improvement_one_thread", 1)):
         say(name.replace("_", " "))
         selector = ImprovementSelector(threads=threads)
         for grid in seeds[:WARM_UP]:  # compiles, builds the tables, starts the threads
             selector.select(grid)
-        _timed(durations, name, (partial(selector.select, grid) for grid in seeds))
+        for grid in seeds:
+            with times.stage(name):
+                selector.select(grid)
 
 
-def _time_neural_gas(seeds: list[SeedGrid], durations: Durations, say: Say) -> None:
+def _time_neural_gas(seeds: list[SeedGrid], times: StageTimes, say: Say) -> None:
     say("neural gas, exact")
-    some = seeds[:: max(1, len(seeds) // EXACT_FRAMES)][:EXACT_FRAMES]
-    train_exact(some[0].points_mm[:64], 16, 1, seed=0)  # compiles
-    exact = (partial(train_exact, grid.points_mm, NODES, EPOCHS, seed=0) for grid in some)
-    _timed(durations, "neural_gas_exact", exact)
+    for grid in seeds:
+        _ = grid.points_mm, grid.uv  # cached: taking the seeds is a stage of its own
+    train_exact(seeds[0].points_mm[:64], 16, 1, seed=0)  # compiles
+    for grid in _spread_over(seeds, EXACT_FRAMES):
+        with times.stage("neural_gas_exact"):
+            train_exact(grid.points_mm, NODES, EPOCHS, seed=0)
     say("neural gas, fast and live")
     live = BatchNeuralGas(NODES, seed=0)
     live.train(seeds[0].points_mm, seeds[0].uv)
-    cold = seeds[:: max(1, len(seeds) // COLD_FRAMES)][:COLD_FRAMES]
-    fast = (partial(BatchNeuralGas(NODES, seed=0).train, grid.points_mm, grid.uv) for grid in cold)
-    _timed(durations, "neural_gas_fast", fast)
+    for grid in _spread_over(seeds, COLD_FRAMES):
+        with times.stage("neural_gas_fast"):
+            BatchNeuralGas(NODES, seed=0).train(grid.points_mm, grid.uv)
     for grid in seeds:
-        _ = grid.points_mm, grid.uv  # cached: taking the seeds is a stage of its own
-        _timed(durations, "neural_gas_live", [partial(live.update, grid.points_mm, grid.uv)])
-        _timed(durations, "regions", [partial(_regions, live, grid)])
+        with times.stage("neural_gas_live"):
+            live.update(grid.points_mm, grid.uv)
+        with times.stage("regions"):
+            delaunay_regions(live.nodes_mm_, node_pixels(live.nodes_mm_, grid), grid.frame_shape)
 
 
-def _regions(gas: BatchNeuralGas, seeds: SeedGrid) -> object:
-    return delaunay_regions(gas.nodes_mm_, node_pixels(gas.nodes_mm_, seeds), seeds.frame_shape)
-
-
-def _whole_loop(source: str, frames: int | None) -> RunReport:
-    with tempfile.TemporaryDirectory() as folder:
-        settings = Settings(
-            run=RunOptions(frames=frames, no_governor=True),
-            play=PlayOptions(realtime=True),
-            viewer=ViewerOptions(headless=True, save=Path(folder) / "bench.rrd"),
-        )
-        session = Session(source, settings)
-        session.run()
-        return session.report
+def _spread_over(seeds: list[SeedGrid], frames: int) -> list[SeedGrid]:
+    """The seeds of so many frames, spread evenly over all of them."""
+    return seeds[:: max(1, len(seeds) // frames)][:frames]

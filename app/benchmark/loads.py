@@ -15,13 +15,10 @@ from selective_depth.app.settings import AcquireOptions, PlayOptions, RunOptions
 RUNS = 3
 DEMO_FRAMES = 300
 _SPENT = AcquireOptions(budget=0.05, rounds=4, even_every=0)
-_UNGOVERNED = Settings(
-    acquire=_SPENT, run=RunOptions(no_governor=True), viewer=ViewerOptions(headless=True, overwrite=True)
-)
 LOADS = {
-    "demo": replace(_UNGOVERNED, acquire=replace(_SPENT, even_every=3), play=PlayOptions(loop=True, realtime=True)),
-    "replay_saved": _UNGOVERNED,
-    "replay": _UNGOVERNED,
+    "demo": Settings(acquire=replace(_SPENT, even_every=3), play=PlayOptions(loop=True, realtime=True)),
+    "replay_saved": Settings(acquire=_SPENT),
+    "replay": Settings(acquire=_SPENT),
 }
 """Both selectors and 5 % more in 4 rounds, a model of every frame: `demo` at a sensor's rate with the even
 lattice's model in every third frame, saved; a recording as fast as it goes, saved and not saved."""
@@ -67,6 +64,16 @@ class Load:
     stages_ms: dict[str, float]
 
 
+def run_once(source: str, settings: Settings, frames: int | None, *, saved: bool = True) -> RunReport:
+    """Run a source without a window, leaving nothing out, and saved for Rerun or not at all; its report."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = RunOptions(frames=frames, no_governor=True)
+        seen = ViewerOptions(headless=True, save=Path(folder) / "bench.rrd" if saved else None)
+        session = Session(source, replace(settings, run=run, viewer=seen))
+        session.run()
+        return session.report
+
+
 def run_loads(source: str, frames: int | None, say: Callable[[str], None]) -> dict[str, Load]:
     """Run every load `RUNS` times.
 
@@ -86,13 +93,7 @@ def _run(source: str, name: str, frames: int | None, say: Callable[[str], None])
     say(f"load '{name}', {RUNS} runs")
     settings = LOADS[name]
     limit = frames or (DEMO_FRAMES if settings.play.loop else None)
-    reports: list[RunReport] = []
-    for _ in range(RUNS):
-        with tempfile.TemporaryDirectory() as folder:
-            seen = replace(settings.viewer, save=None if name == "replay" else Path(folder) / "bench.rrd")
-            session = Session(source, replace(settings, run=replace(settings.run, frames=limit), viewer=seen))
-            session.run()
-            reports.append(session.report)
+    reports = [run_once(source, settings, limit, saved=name != "replay") for _ in range(RUNS)]
 
     def spread(of: Callable[[RunReport], float]) -> Spread:
         return Spread.of([of(report) for report in reports])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
 from pathlib import Path
 
 from rich.console import Console
@@ -12,48 +13,8 @@ from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.output import check_output, write_output
 from selective_depth.app.pipeline import say
 
-PAGE = """# Benchmark
-
-Made by `selective-depth bench {report.source} --page benchmark.md`; every figure is of one run.
-{host}.
-
-The same work in other libraries, timed in the same run:
-
-| peer | its time | our stage | times slower |
-|---|---:|---|---:|
-{peers}
-
-`krigekit_ordinary_kriging` (Fortran, all threads) and `pykrige_ordinary_kriging` krig every pixel
-of the first frame from its 16 nearest seeds, estimate and variance only; PyKrige's time is extended
-from two samples of the pixels. `numpy_neural_gas` is a plain NumPy loop of eq. (1)-(4), extended
-from 3,000 steps to 50 epochs.
-
-Whole runs, medians of three and their spread, nothing left out (`--no-governor`): `demo` is {report.source} in
-real time in a loop, both selectors, 5 % more in 4 rounds, a model of every frame and the even lattice's of every
-third, saved; `replay_saved` and `replay` the same without the even lattice, as fast as they go:
-
-| load | frames/s | dropped | loop p99 ms | log p99 ms | processor ms a frame |
-|---|---:|---:|---:|---:|---:|
-{loads}
-
-The whole loop without a budget, both selectors with the live neural gas, saving for Rerun, on {report.source}
-played in real time: **{report.fps:.1f} frames/s over {report.frames} frames, {report.dropped}
-dropped**, {report.threads} kernel threads.
-
-| stage | p50 ms | p99 ms | max ms | runs |
-|---|---:|---:|---:|---:|
-{stages}
-
-`improvement` is the whole map with estimate and variance, holes and borders included;
-`neural_gas_exact` and `neural_gas_fast` train 2,800 nodes from nothing (exact: 50 epochs of
-eq. (1)-(4)); `neural_gas_live` goes on from the last frame; `regions` is Delaunay and both masks;
-`log` is what the viewer's thread spends on a frame beside the loop; `loop` is the whole turn.
-
-How exact the timed code is: the map against eq. (13) in float64 in
-[improvement.md](improvement.md), the trainings against a plain float64 loop and against each
-other in [neural-gas.md](neural-gas.md). How near the stages come to what the machine allows:
-[limits.md](limits.md). Times vary from run to run on a shared machine; the ratios vary less.
-"""
+PAGE = "page.md"
+"""The page's text beside this module, with places for the figures."""
 
 
 def run_bench(source: str, frames: int | None, *, json: Path | None, page: Path | None, peers: bool) -> None:
@@ -123,4 +84,5 @@ def to_page(report: BenchReport) -> str:
     peers = "\n".join(f"| `{peer}` | {took} s | `{stage}` | {more} |" for peer, took, stage, more in _peer_rows(report))
     loads = "\n".join(f"| `{name}` | {' | '.join(figures)} |" for name, *figures in _load_rows(report))
     host = ", ".join(f"{name} {value}" for name, value in report.machine.items())
-    return PAGE.format(report=report, stages=stages, peers=peers, loads=loads, host=host)
+    text = files(__package__).joinpath(PAGE).read_text(encoding="utf-8")
+    return text.format(report=report, stages=stages, peers=peers, loads=loads, host=host)
