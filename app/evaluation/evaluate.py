@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of, strategy_of
 from selective_depth.app.pipeline import open_and_tell
-from selective_depth.app.settings import Settings
+from selective_depth.app.settings import ComparisonOptions, Settings
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
@@ -36,6 +37,14 @@ from selective_depth.selectors.reconstruct import reconstruct
 ENDLESS_FRAMES = 120
 """So much is looked at of a source without end."""
 
+FULL_NAMES = {
+    "geo": "ratio_geometric_mean",
+    "worst": "ratio_worst",
+    "share": "oracle_share_mean",
+    "share_min": "oracle_share_least",
+    "wrong": "wrong_share",
+    "missed": "missed_share",
+}
 Results = dict[str, dict[str, dict[str, float]]]
 """Budget -> strategy -> figure, as the JSON file has it."""
 _Chosen = Iterator[tuple[int, DepthFrame]]
@@ -109,19 +118,16 @@ _Keep = Callable[[int, list[Outcome]], None]
 
 
 def _evaluate_frame(
-    budgets: Sequence[float], rounds: int, draws: int, strategies: Sequence[str], settings: Settings, frame: DepthFrame
+    options: ComparisonOptions, names: Sequence[str], settings: Settings, frame: DepthFrame
 ) -> list[Outcome]:
-    seeds_shape = settings.seeds.rows, settings.seeds.columns
     label = f"{frame.source} {frame.index}"
     outcomes = []
-    for budget in budgets:
+    for budget, name in product(options.budget, names):
         shots = shots_of(float(budget), frame.shape)
-        measured = (shots + seeds_shape[0] * seeds_shape[1]) / frame.depth_mm.size
-        for name in strategies:
-            seeds = range(draws if strategy_of(name).chance else 1)
-            cases = (Case(frame, seeds_shape, shots, rounds, seed, settings) for seed in seeds)
-            errors = tuple(run_strategy(name, case) for case in cases)
-            outcomes.append(Outcome(label, budget, name, errors, frame.source, frame.index, measured))
+        measured = (shots + settings.seeds.rows * settings.seeds.columns) / frame.depth_mm.size
+        draws = range(options.random_seeds if strategy_of(name).chance else 1)
+        errors = tuple(run_strategy(name, Case(frame, settings, shots, options.rounds, seed)) for seed in draws)
+        outcomes.append(Outcome(label, budget, name, errors, frame.source, frame.index, measured))
     return outcomes
 
 
@@ -155,25 +161,18 @@ def frames_of(sources: Sequence[str], every: int, frames: int | None) -> Iterato
                     break
 
 
-def check_named(sources: Sequence[str], budgets: Sequence[float]) -> None:
+def check_named(sources: Sequence[str], options: ComparisonOptions) -> None:
     """Refuse a comparison on no source, or of no budget."""
     if not sources:
         raise UsageError("no source was named; give recordings, folders or scenes.")
-    if not budgets:
+    if not options.budget:
         raise UsageError("--budget names no share; give one or more, such as 5% 10%.")
 
 
 def outcomes(
     sources: Sequence[str],
-    *,
-    every: int = 20,
-    frames: int | None = None,
-    budgets: Sequence[float] = (0.05, 0.10),
-    rounds: int = 8,
-    random_seeds: int = 3,
-    strategies: Sequence[str] = ("all",),
-    jobs: int | str | None = None,
-    settings: Settings | None = None,
+    options: ComparisonOptions,
+    settings: Settings,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Outcome]:
     """Run the strategies on frames of some sources.
@@ -182,22 +181,10 @@ def outcomes(
     ----------
     sources : sequence of str
         As `open_source` takes them.
-    every : int, default 20
-        Take every n-th frame.
-    frames : int, optional
-        At most so many frames of each source.
-    budgets : sequence of float, default (0.05, 0.10)
-        Measurements beyond the seeds as shares of the frame's pixels.
-    rounds : int, default 8
-        Rounds of the closed loops.
-    random_seeds : int, default 3
-        How often strategies that draw at random are run.
-    strategies : sequence of str, optional
-        As `strategies_of` takes them; default all. "uniform" and "oracle" are always run.
-    jobs : int or str, optional
-        Processes; default one per processor, and 1 runs in this one. Or the scheduler of a Dask
-        cluster, as for `archive.engine`.
-    settings : Settings, optional
+    options : ComparisonOptions
+        Which frames, budgets and strategies; "uniform" and "oracle" are always run. One job runs
+        in this process; the scheduler is one as for `archive.engine`.
+    settings : Settings
         Of the seeds, and of the two published selectors.
     progress : callable, optional
         Called with the frames done and the frames in all, as far as they are known.
@@ -209,12 +196,12 @@ def outcomes(
     SourceNotFoundError
         If the sources hold no frame with depth.
     """
-    check_named(sources, budgets)
-    wanted = {*strategies_of(strategies), "uniform", "oracle"}
+    check_named(sources, options)
+    wanted = {*strategies_of(options.strategies), "uniform", "oracle"}
     names = [n for n in STRATEGIES if n in wanted] + sorted(wanted.difference(STRATEGIES))
-    jobs = jobs or default_threads()
-    work: _Work = partial(_evaluate_frame, budgets, rounds, random_seeds, names, settings or Settings())
-    total = _most(sources, every, frames)
+    jobs = options.jobs or default_threads()
+    work: _Work = partial(_evaluate_frame, options, names, settings)
+    total = _most(sources, options)
     found: dict[int, list[Outcome]] = {}
 
     def keep(number: int, outcomes: list[Outcome]) -> None:
@@ -222,9 +209,9 @@ def outcomes(
         progress(len(found), total)
 
     progress(0, total)
-    chosen = enumerate(frames_of(sources, every, frames))
-    if isinstance(jobs, str):
-        with engine(jobs) as client:
+    chosen = enumerate(frames_of(sources, options.every, options.frames))
+    if options.scheduler is not None:
+        with engine(options.scheduler) as client:
             workers = max(1, sum(client.nthreads().values()))
             _through(client.get_executor(pure=False), chosen, work, workers, keep)
     elif min(jobs, total) == 1:
@@ -238,13 +225,13 @@ def outcomes(
     return [outcome for number in sorted(found) for outcome in found[number]]
 
 
-def _most(sources: Sequence[str], every: int, frames: int | None) -> int:
+def _most(sources: Sequence[str], options: ComparisonOptions) -> int:
     """How many frames `frames_of` finds, if all of them show something."""
     total = 0
     for uri in sources:
         with open_and_tell(uri) as source:
             count = ENDLESS_FRAMES if source.frame_count is None else source.frame_count
-        total += min(-(-count // every), frames or count)
+        total += min(-(-count // options.every), options.frames or count)
     return total
 
 
@@ -287,33 +274,32 @@ def summarise(found: Sequence[Outcome]) -> Results:
 
     ``geo`` and ``worst``: geometric mean and greatest of the RMSE ratio to `uniform`; ``share``
     and ``share_min``: mean and least of the oracle share, the way covered from `uniform` to
-    `oracle`; ``rmse_mm``, ``mae_mm``, ``wrong``, ``missed``: means.
+    `oracle`; ``wrong``, ``missed``: mean shares. Each of these has its full name as well
+    (`FULL_NAMES`). ``rmse_mm``, ``mae_mm``: means.
     """
     results: Results = {}
     peers = {(o.frame, o.budget, o.strategy): o.errors[0].rmse_mm for o in found}
-    for budget in dict.fromkeys(o.budget for o in found):
-        table: dict[str, dict[str, float]] = {}
-        for name in dict.fromkeys(o.strategy for o in found):
-            ratios, shares, errors = [], [], []
-            for outcome in found:
-                if (outcome.budget, outcome.strategy) != (budget, name):
-                    continue
-                uniform = peers[outcome.frame, budget, "uniform"]
-                oracle = peers[outcome.frame, budget, "oracle"]
-                for error in outcome.errors:
-                    errors.append(error)
-                    if uniform > 0:
-                        ratios.append(error.rmse_mm / uniform)
-                    if uniform > oracle:
-                        shares.append((uniform - error.rmse_mm) / (uniform - oracle))
-            positive = np.maximum(ratios, 1e-9)
-            table[name] = {
-                "geo": float(np.exp(np.mean(np.log(positive)))) if ratios else 1.0,
-                "worst": max(ratios, default=1.0),
-                "share": float(np.mean(shares)) if shares else 0.0,
-                "share_min": min(shares, default=0.0),
-            }
-            for figure in ("rmse_mm", "mae_mm", "wrong", "missed"):
-                table[name][figure] = float(np.mean([getattr(error, figure) for error in errors]))
-        results[f"{budget:.2f}" if round(budget, 2) == budget else f"{budget:g}"] = table
+    for budget, name in dict.fromkeys((o.budget, o.strategy) for o in found):
+        ratios: list[float] = []
+        shares: list[float] = []
+        errors: list[Errors] = []
+        for outcome in found:
+            if (outcome.budget, outcome.strategy) != (budget, name):
+                continue
+            errors += outcome.errors
+            uniform, oracle = (peers[outcome.frame, budget, peer] for peer in ("uniform", "oracle"))
+            if uniform > 0:
+                ratios += [error.rmse_mm / uniform for error in outcome.errors]
+            if uniform > oracle:
+                shares += [(uniform - error.rmse_mm) / (uniform - oracle) for error in outcome.errors]
+        figures = {
+            "geo": float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-9))))) if ratios else 1.0,
+            "worst": max(ratios, default=1.0),
+            "share": float(np.mean(shares)) if shares else 0.0,
+            "share_min": min(shares, default=0.0),
+        }
+        for figure in ("rmse_mm", "mae_mm", "wrong", "missed"):
+            figures[figure] = float(np.mean([getattr(error, figure) for error in errors]))
+        figures |= {full: figures[short] for short, full in FULL_NAMES.items()}
+        results.setdefault(f"{budget:.2f}" if round(budget, 2) == budget else f"{budget:g}", {})[name] = figures
     return results

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pyarrow as pa
 
@@ -14,53 +14,38 @@ from selective_depth.app import __version__
 from selective_depth.app.console import tables
 from selective_depth.app.evaluation.evaluate import Outcome, summarise
 from selective_depth.app.evaluation.strategies import strategy_of
+from selective_depth.app.settings import ComparisonOptions, Settings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA = 1
 """Version of the JSON document and of the table."""
-FULL_WORDS = {
-    "geo": "ratio_geometric_mean",
-    "worst": "ratio_worst",
-    "share": "oracle_share_mean",
-    "share_min": "oracle_share_least",
-    "wrong": "wrong_share",
-    "missed": "missed_share",
-}
 TABLES = (".parquet", ".csv")
 
 
-def _in_full(found: Sequence[Outcome]) -> dict[str, dict[str, dict[str, float]]]:
-    """`summarise`, with every figure under its full name as well as its short one."""
-    return {
-        budget: {
-            name: figures | {FULL_WORDS[key]: figures[key] for key in FULL_WORDS} for name, figures in table.items()
-        }
-        for budget, table in summarise(found).items()
-    }
-
-
-def to_json(found: Sequence[Outcome], settings: dict[str, Any]) -> str:
+def to_json(found: Sequence[Outcome], options: ComparisonOptions, settings: Settings) -> str:
     """The whole evaluation: figures by budget and strategy, in all and per source, and its making.
 
     Parameters
     ----------
     found : sequence of Outcome
         What every strategy made of every frame.
-    settings : dict
-        The options that it was made with.
+    options, settings
+        What it was made with.
     """
-    sources = {
-        source: _in_full([each for each in found if each.source == source])
-        for source in dict.fromkeys(each.source for each in found)
-    }
     document = {
-        **_in_full(found),
+        **summarise(found),
         "schema": SCHEMA,
         "version": __version__,
-        "settings": settings,
-        "sources": sources,
+        "settings": {
+            "comparison": asdict(options),
+            **{name: asdict(getattr(settings, name)) for name in ("seeds", "gas", "improvement")},
+        },
+        "sources": {
+            source: summarise([each for each in found if each.source == source])
+            for source in dict.fromkeys(each.source for each in found)
+        },
         "frames": [asdict(outcome) for outcome in found],
     }
     return json.dumps(document, indent=1) + "\n"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,7 @@ from selective_depth.drivers.open import open_source
 from selective_depth.selectors.acquire import acquire
 from selective_depth.selectors.memory import TemporalAcquisition, TemporalStep
 from selective_depth.selectors.memory.store import KEPT
+from selective_depth.selectors.quality import errors_of
 from selective_depth.selectors.seeds import SeedGrid
 
 if TYPE_CHECKING:
@@ -45,13 +46,12 @@ class Course:
     rmse_mm: list[float] = field(default_factory=list)
     mae_mm: list[float] = field(default_factory=list)
 
-    def add(self, model_mm: npt.NDArray[Any], truth_mm: npt.NDArray[Any],
-            scored: npt.NDArray[np.bool_]) -> None:  # fmt: skip
+    def add(self, model_mm: npt.NDArray[Any], truth_mm: npt.NDArray[np.uint16], scored: npt.NDArray[np.bool_]) -> None:
         """Take in the model of a frame; where it has no depth it is not scored."""
-        valid = scored & (model_mm > 0)
-        off = model_mm[valid].astype(np.float64) - truth_mm[valid]
-        self.rmse_mm.append(float(np.sqrt(np.mean(off**2))) if off.size else math.nan)
-        self.mae_mm.append(float(np.mean(np.abs(off))) if off.size else math.nan)
+        known_mm = np.where(scored & (model_mm > 0), truth_mm, 0)
+        rmse_mm, mae_mm, _ = errors_of(model_mm, known_mm) if known_mm.any() else (math.nan,) * 3
+        self.rmse_mm.append(rmse_mm)
+        self.mae_mm.append(mae_mm)
 
 
 def _frames(uri: str, limit: int | None) -> Iterator[DepthFrame]:
@@ -81,14 +81,8 @@ def _often_returning(uri: str, frames: int | None) -> npt.NDArray[np.bool_] | No
 
 
 def over_time(
-    uri: str,
-    budget: float,
-    *,
-    frames: int | None = None,
-    seeds_shape: tuple[int, int] = (128, 128),
-    rounds: int = 8,
-    each: Callable[[DepthFrame, TemporalStep], None] = lambda frame, step: None,
-) -> dict[str, Course]:
+    uri: str, options: ComparisonOptions, settings: Settings
+) -> Iterator[tuple[DepthFrame, TemporalStep, dict[str, Course]]]:
     """Follow a source with memory and without it.
 
     Parameters
@@ -96,21 +90,20 @@ def over_time(
     uri : str
         As `open_source` takes it. Errors are against exact truth where the source knows it, else
         against the frame itself.
-    budget : float
-        All measurements of a frame with memory, after the first, as a share of its pixels.
-    frames : int, optional
-        At most so many.
-    seeds_shape : tuple of int, default (128, 128)
-        Rows and columns of the seed lattice.
-    rounds : int, default 8
-        Rounds of the acquisition without memory, and of a first frame with it.
-    each : callable, optional
-        Called with every frame and what the memory came to.
+    options : ComparisonOptions
+        How many frames; the first budget is that of all measurements of a frame with memory, after
+        the first; the rounds are those of the acquisition without memory, and of a first frame with it.
+    settings : Settings
+        Of the seeds.
 
-    Returns
-    -------
+    Yields
+    ------
+    DepthFrame
+        Every frame, when it has been followed.
+    TemporalStep
+        What the memory came to.
     dict
-        A `Course` for each of `WAYS`: memory; the closed loop of seeds and 5 % more in every frame;
+        A `Course` so far for each of `WAYS`: memory; the closed loop of seeds and 5 % more in every frame;
         the frame as the sensor gives it; the median of the last frames, 31 at most. Scored are the
         pixels with exact depth that return depth in more than half of the frames; where anything
         moves, those that return it in the frame.
@@ -120,30 +113,32 @@ def over_time(
     SourceNotFoundError
         If the source has no frame.
     """
-    often = _often_returning(uri, frames)
+    often = _often_returning(uri, options.frames)
     courses = {way: Course() for way in WAYS}
+    seeds_shape = settings.seeds.rows, settings.seeds.columns
     memory: TemporalAcquisition | None = None
     last: deque[npt.NDArray[np.float32]] = deque(maxlen=KEPT)
-    for frame in _frames(uri, frames):
-        truth = _truth(frame)
-        scored = truth > 0
-        scored &= (frame.depth_mm > 0) if often is None else often
+    for frame in _frames(uri, options.frames):
         if memory is None:
             memory = TemporalAcquisition(
-                frame.shape, budget=budget, first_budget=FIRST_BUDGET, seeds=seeds_shape, rounds=rounds
+                frame.shape,
+                budget=float(options.budget[0]),
+                first_budget=FIRST_BUDGET,
+                seeds=seeds_shape,
+                rounds=options.rounds,
             )
         step = memory.step(frame.measure)
-        courses["memory"].add(step.model_mm, truth, scored)
         seeds = SeedGrid.from_frame(frame, seeds_shape)
-        loop = acquire(frame.measure, seeds, FIRST_BUDGET, rounds)
-        courses["memoryless"].add(loop.reconstruct(), truth, scored)
-        courses["whole_frame"].add(frame.depth_mm, truth, scored)
+        loop = acquire(frame.measure, seeds, FIRST_BUDGET, options.rounds)
         last.append(np.where(frame.depth_mm > 0, frame.depth_mm, np.float32(np.nan)))
-        courses["median"].add(_median(last), truth, scored)
-        each(frame, step)
+        truth = _truth(frame)
+        scored = (truth > 0) & ((frame.depth_mm > 0) if often is None else often)
+        models: list[npt.NDArray[Any]] = [step.model_mm, loop.reconstruct(), frame.depth_mm, _median(last)]
+        for way, model_mm in zip(WAYS, models, strict=True):
+            courses[way].add(model_mm, truth, scored)
+        yield frame, step, courses
     if memory is None:
         raise SourceNotFoundError(f"'{uri}' has no frame; give another source.")
-    return courses
 
 
 def _median(frames: deque[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
@@ -168,23 +163,17 @@ def run_over_time(
     OutputError
         If a file cannot be written.
     """
-    check_named(sources, options.budget)
-    budget, seeds_shape = float(options.budget[0]), (settings.seeds.rows, settings.seeds.columns)
+    check_named(sources, options)
+    budget = float(options.budget[0])
     found: dict[str, dict[str, Course]] = {}
-    last: list[tuple[DepthFrame, TemporalStep]] = []
     for uri in sources:
         with FrameProgress(f"Following {uri}", options.frames) as bar:
-
-            def each(frame: DepthFrame, step: TemporalStep, bar: FrameProgress = bar) -> None:
-                bar.update(step.frame + 1)
-                last[:] = [(frame, step)]
-
-            found[uri] = over_time(
-                uri, budget, frames=options.frames, seeds_shape=seeds_shape, rounds=options.rounds, each=each
-            )
+            for followed in over_time(uri, options, settings):
+                bar.update(followed[1].frame + 1)
+        frame, step, found[uri] = followed
         _print(uri, found[uri], budget)
         if files.picture is not None and len(found) == 1:
-            write_picture(files.picture, _picture(*last[0]))
+            write_picture(files.picture, _picture(frame, step))
             say(f"wrote {files.picture}")
     if files.json is not None:
         document = {

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,14 +20,12 @@ from selective_depth.app.pictures.panels import error_panel, shots_panel
 from selective_depth.app.pictures.sheets import WIDTH_IN
 from selective_depth.app.pipeline import say
 from selective_depth.app.settings import ComparisonOptions, EvaluationFiles, PictureOptions, Settings
-from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import acquire, shots_of
 from selective_depth.selectors.reconstruct import reconstruct
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SHOWN = ("uniform", "improvement", "gradient", "step", "loop", "oracle")
 TITLES = {
     "uniform": "Even lattice",
     "improvement": "Published, one shot",
@@ -36,6 +34,7 @@ TITLES = {
     "loop": "Surface score, closed loop",
     "oracle": "Oracle",
 }
+"""The strategies of the picture, from left to right."""
 COLUMNS = {
     "ratio": ("geo", "{:.3f}"),
     "worst": ("worst", "{:.3f}"),
@@ -71,40 +70,24 @@ def run_evaluation(
     check_picture(files.table, TABLES, "table")
     if options.over_time:
         return run_over_time(sources, options, settings, files)
-    seeds_shape = settings.seeds.rows, settings.seeds.columns
     with FrameProgress("Evaluating", None) as bar:
-        found = outcomes(
-            sources,
-            every=options.every,
-            frames=options.frames,
-            budgets=options.budget,
-            rounds=options.rounds,
-            random_seeds=options.random_seeds,
-            strategies=options.strategies,
-            jobs=options.scheduler or options.jobs,
-            settings=settings,
-            progress=lambda done, total: bar.update(done, f"of {total}"),
-        )
+        found = outcomes(sources, options, settings, lambda done, total: bar.update(done, f"of {total}"))
     print_results(summarise(found), len({outcome.frame for outcome in found}), options.rounds)
-    if files.json is not None:
-        made_with = {
-            "comparison": asdict(options),
-            **{name: asdict(getattr(settings, name)) for name in ("seeds", "gas", "improvement")},
-        }
-        write_output(files.json, to_json(found, made_with))
-    if files.table is not None:
-        write_table(files.table, found)
-    if files.page is not None:
-        write_output(files.page, to_markdown(found))
-    if files.picture is not None:
+
+    def first_frame() -> Figure:
         frame = next(frames_of(sources, options.every, 1))
-        budget, rounds = options.budget[0], options.rounds
-        shown = comparison(frame, budget, rounds=rounds, seeds_shape=seeds_shape, width_in=page.width)
-        write_picture(files.picture, shown, page.dpi)
-    if files.curves is not None:
-        write_picture(files.curves, curves(found, page.width), page.dpi)
-    for path in (files.json, files.table, files.page, files.picture, files.curves):
+        return comparison(Case(frame, settings, shots_of(options.budget[0], frame.shape), options.rounds), page.width)
+
+    outputs: list[tuple[Path | None, Callable[[Path], None]]] = [
+        (files.json, lambda path: write_output(path, to_json(found, options, settings))),
+        (files.table, lambda path: write_table(path, found)),
+        (files.page, lambda path: write_output(path, to_markdown(found))),
+        (files.picture, lambda path: write_picture(path, first_frame(), page.dpi)),
+        (files.curves, lambda path: write_picture(path, curves(found, page.width), page.dpi)),
+    ]
+    for path, write in outputs:
         if path is not None:
+            write(path)
             say(f"wrote {path}")
 
 
@@ -142,8 +125,9 @@ def to_markdown(found: Sequence[Outcome]) -> str:
     return "\n".join(lines)
 
 
-def _shown(frame: DepthFrame, name: str, case: Case) -> tuple[Panel, Panel]:
+def _shown(case: Case, name: str) -> tuple[Panel, Panel]:
     """Where a strategy measured, and how wrong the model of it is."""
+    frame = case.frame
     if name == "loop":
         acquisition = acquire(frame.measure, case.seeds, rounds=case.rounds, shots=case.shots)
         uv, rounds = acquisition.uv, acquisition.round
@@ -151,39 +135,22 @@ def _shown(frame: DepthFrame, name: str, case: Case) -> tuple[Panel, Panel]:
         uv = STRATEGIES[name].pixels(case)
         seeds = 0 if name == "uniform" else len(case.seed_uv)
         rounds = np.where(np.arange(len(uv)) < seeds, 0, 1)
-    shots = shots_panel(frame, uv, rounds, TITLES.get(name, name))
+    shots = shots_panel(frame, uv, rounds, TITLES[name])
     error = error_panel(frame, reconstruct(uv, frame.measure(uv), frame.shape), "Model error")
     return shots, error
 
 
-def comparison(
-    frame: DepthFrame,
-    budget: float,
-    *,
-    rounds: int = 8,
-    seeds_shape: tuple[int, int] = (128, 128),
-    strategies: Sequence[str] = SHOWN,
-    width_in: float = WIDTH_IN,
-) -> Figure:
-    """Where each strategy measured, above the error of its model.
+def comparison(case: Case, width_in: float = WIDTH_IN) -> Figure:
+    """Where each strategy of `TITLES` measured, above the error of its model.
 
     Parameters
     ----------
-    frame : DepthFrame
-        What is measured.
-    budget : float
-        Measurements beyond the seeds, as a share of the frame's pixels.
-    rounds : int, default 8
-        Rounds of the closed loops.
-    seeds_shape : tuple of int, default (128, 128)
-        Rows and columns of the seed lattice.
-    strategies : sequence of str
-        Names out of `STRATEGIES`, from left to right.
+    case : Case
+        What is measured, and the budget.
     width_in : float, default 16
         Width of the page in inches.
     """
-    case = Case(frame, seeds_shape, shots_of(float(budget), frame.shape), rounds, 0)
-    shots, errors = zip(*(_shown(frame, name, case) for name in strategies), strict=True)
-    total = (len(case.seed_uv) + case.shots) / frame.depth_mm.size
+    shots, errors = zip(*(_shown(case, name) for name in TITLES), strict=True)
+    total = (len(case.seed_uv) + case.shots) / case.frame.depth_mm.size
     title = f"The same {total:.1%} of the pixels: where they are measured, and the model's error"
     return sheet([(title, shots), ("", errors)], width_in, legend=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import cv2
@@ -36,39 +36,31 @@ class Case:
     ----------
     frame : DepthFrame
         The sensor. Only the oracle looks at it; the others go through `measure`.
-    seeds_shape : tuple of int
-        Rows and columns of the seed lattice.
+    settings : Settings
+        Options of the seeds and of the two published selectors.
     shots : int
         Measurements allowed beyond the seeds.
     rounds : int
         Rounds of the closed loops.
-    seed : int
+    seed : int, default 0
         Of the random draws.
-    settings : Settings
-        Options of the two published selectors.
     """
 
     frame: DepthFrame
-    seeds_shape: tuple[int, int]
+    settings: Settings
     shots: int
     rounds: int
-    seed: int
-    settings: Settings = field(default_factory=Settings)
+    seed: int = 0
 
     @cached_property
     def seeds(self) -> SeedGrid:
         """The first measurements."""
-        return SeedGrid.from_frame(self.frame, self.seeds_shape)
+        return SeedGrid.from_frame(self.frame, (self.settings.seeds.rows, self.settings.seeds.columns))
 
     @cached_property
     def seed_uv(self) -> Pixels:
         """Pixels of all seeds, with depth or without, shape (n, 2)."""
         return self.seeds.lattice_uv.reshape(-1, 2)
-
-    @cached_property
-    def estimate_mm(self) -> npt.NDArray[np.float32]:
-        """Depth interpolated from the seeds."""
-        return reconstruct(self.seed_uv, self.seeds.depth_mm.ravel(), self.frame.shape)
 
     @cached_property
     def samples(self) -> Samples:
@@ -95,9 +87,9 @@ class Case:
         """The settings, with the seed of this case's draws."""
         return replace(self.settings, gas=replace(self.settings.gas, seed=self.seed))
 
-    def lattice(self, pixels: float) -> Pixels:
-        """A fresh lattice of square pitch with about so many pixels."""
-        return even_lattice(self.frame.shape, pixels)
+    def lattice(self, times: float = 1.0) -> Pixels:
+        """A fresh lattice of square pitch, of about so many times the measurements that there are to spend."""
+        return even_lattice(self.frame.shape, times * (len(self.seed_uv) + self.shots))
 
     def best(self, worth: npt.NDArray[np.floating]) -> Pixels:
         """Seeds, and the open pixels that are worth most."""
@@ -116,11 +108,6 @@ class Case:
 
 def _loop(case: Case, rounds: int, selector: Selector | Worth | None = None) -> Pixels:
     return acquire(case.frame.measure, case.seeds, rounds=rounds, selector=selector, shots=case.shots).uv
-
-
-def _gradient(case: Case) -> Pixels:
-    down, right = np.gradient(case.estimate_mm)
-    return case.best(np.hypot(down, right))
 
 
 def _random(case: Case) -> Pixels:
@@ -170,11 +157,15 @@ class Strategy:
     reference: bool = False
 
 
+def _slope(samples: Samples) -> npt.NDArray[np.float32]:
+    """Slope of the model of some samples."""
+    down, right = np.gradient(reconstruct(samples.uv, samples.depth_mm, samples.frame_shape))
+    return np.asarray(np.hypot(down, right))
+
+
 def _slope_by_gap(samples: Samples) -> npt.NDArray[np.float32]:
-    """The three-line score that any other must beat: slope of the model times the gap."""
-    model_mm = reconstruct(samples.uv, samples.depth_mm, samples.frame_shape)
-    down, along = np.gradient(model_mm)
-    return np.asarray(np.hypot(down, along) * np.minimum(samples.gap_px(), 4), np.float32)
+    """The simple score that any other must beat: slope of the model times the gap."""
+    return np.asarray(_slope(samples) * np.minimum(samples.gap_px(), 4), np.float32)
 
 
 SELECTORS: dict[str, tuple[str, bool]] = {
@@ -208,7 +199,7 @@ def _driven(name: str, about: str, chance: bool) -> dict[str, Strategy]:
 
 
 STRATEGIES: dict[str, Strategy] = {
-    "uniform": Strategy("a fresh lattice", lambda c: c.lattice(len(c.seed_uv) + c.shots)),
+    "uniform": Strategy("a fresh lattice", Case.lattice),
     "random": Strategy("anywhere near a sample", _random, chance=True),
     "gap": Strategy("farthest from the samples first", lambda c: c.best(c.samples.gap_px())),
     "variance": Strategy(
@@ -222,16 +213,16 @@ STRATEGIES: dict[str, Strategy] = {
     "improvement_loop": Strategy(
         "published improvement, closed loop", lambda c: _selected(c, "improvement", loop=True)
     ),
-    "gradient": Strategy("gradient of the interpolated depth, one shot", _gradient),
+    "gradient": Strategy("gradient of the interpolated depth, one shot", lambda c: c.best(_slope(c.samples))),
     "quadtree": Strategy("quad-tree, largest error split first", lambda c: quadtree(c.frame.measure, c.seeds, c.shots)),
     "step": Strategy("step score, one shot", lambda c: _loop(c, 1)),
     "loop": Strategy("surface score, closed loop: the default", lambda c: _loop(c, c.rounds)),
     "oracle": Strategy("largest true error, 16 batches", _oracle),
-    "uniform_x3": Strategy(
-        "a fresh lattice, 3 times the samples", lambda c: c.lattice(3 * (len(c.seed_uv) + c.shots)), reference=True
-    ),
+    "uniform_x3": Strategy("a fresh lattice, 3 times the samples", lambda c: c.lattice(3), reference=True),
     "uniform_70": Strategy(
-        "a lattice of 70 % of all pixels", lambda c: c.lattice(0.7 * c.frame.depth_mm.size), reference=True
+        "a lattice of 70 % of all pixels",
+        lambda c: even_lattice(c.frame.shape, 0.7 * c.frame.depth_mm.size),
+        reference=True,
     ),
 }
 for _name, _words in SELECTORS.items():

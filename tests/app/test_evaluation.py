@@ -21,10 +21,10 @@ from selective_depth.app.evaluation import evaluate as protocol
 from selective_depth.app.evaluation.evaluate import Errors, Outcome, outcomes, summarise
 from selective_depth.app.evaluation.over_time import over_time
 from selective_depth.app.evaluation.quadtree import quadtree
-from selective_depth.app.evaluation.report import comparison, print_results, to_markdown
+from selective_depth.app.evaluation.report import TITLES, comparison, print_results, to_markdown
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of
 from selective_depth.app.pictures import palette
-from selective_depth.app.settings import SeedOptions, Settings
+from selective_depth.app.settings import ComparisonOptions, SeedOptions, Settings
 from selective_depth.drivers.errors import OutputError, SourceNotFoundError
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.source import DepthSource
@@ -59,11 +59,16 @@ def folder(tmp_path: Path) -> Path:
 
 SHAPE = (32, 32)
 SHOTS = 900
+SETTINGS = Settings(seeds=SeedOptions(*SHAPE))
+
+
+def case_of(shots: int, rounds: int, seen: DepthFrame | None = None) -> Case:
+    return Case(seen or frame(), SETTINGS, shots, rounds)
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_every_strategy_keeps_to_its_budget(name: str) -> None:
-    case = Case(frame(), SHAPE, SHOTS, 4, 0)
+    case = case_of(SHOTS, 4)
     uv = STRATEGIES[name].pixels(case)
     assert len(np.unique(uv, axis=0)) == len(uv), "no pixel is paid for twice"
     assert (uv >= 0).all() and (uv < (WIDTH, HEIGHT)).all()
@@ -82,19 +87,19 @@ def test_every_strategy_keeps_to_its_budget(name: str) -> None:
 @pytest.mark.parametrize("name", [n for n in STRATEGIES if n != "oracle"])
 def test_no_strategy_but_the_oracle_sees_what_it_does_not_measure(name: str) -> None:
     truth = frame()
-    first = STRATEGIES[name].pixels(Case(truth, SHAPE, SHOTS, 3, 0))
+    first = STRATEGIES[name].pixels(case_of(SHOTS, 3, truth))
     known = np.zeros(truth.shape, np.bool_)
     known[first[:, 1], first[:, 0]] = True
     seeds = SeedGrid.from_frame(truth, SHAPE).lattice_uv.reshape(-1, 2)
     known[seeds[:, 1], seeds[:, 0]] = True
     other = np.where(known, truth.depth_mm, 777).astype(np.uint16)
     changed = DepthFrame(other, 0, 0, truth.camera)
-    second = STRATEGIES[name].pixels(Case(changed, SHAPE, SHOTS, 3, 0))
+    second = STRATEGIES[name].pixels(case_of(SHOTS, 3, changed))
     np.testing.assert_array_equal(first, second)
 
 
 def test_what_returned_nothing_is_counted_among_all_measurements() -> None:
-    case = Case(frame(), SHAPE, SHOTS, 1, 0)
+    case = case_of(SHOTS, 1)
     u, v = STRATEGIES["random"].pixels(case).T
     in_hole = (v >= 20) & (v < 40) & (u >= 100) & (u < 120)
     assert in_hole.any()
@@ -103,7 +108,7 @@ def test_what_returned_nothing_is_counted_among_all_measurements() -> None:
 
 def made_of(depth_mm: np.ndarray) -> Case:
     camera = Camera.kinect(WIDTH, HEIGHT)
-    return Case(DepthFrame(depth_mm.astype(np.uint16), 0, 0, camera), SHAPE, 300, 4, 0)
+    return case_of(300, 4, DepthFrame(depth_mm.astype(np.uint16), 0, 0, camera))
 
 
 @pytest.mark.parametrize("upright", [True, False])
@@ -117,7 +122,7 @@ def test_the_gradient_shoots_at_steps_either_way(upright: bool) -> None:
 
 @pytest.mark.parametrize(("name", "inside"), [("neural_gas", True), ("neural_gas_complement", False)])
 def test_the_gas_shoots_in_its_regions_and_its_complement_outside(name: str, inside: bool) -> None:
-    case = Case(frame(), SHAPE, 400, 1, 0)
+    case = case_of(400, 1)
     u, v = STRATEGIES[name].pixels(case)[len(case.seed_uv) :].T
     share = case.regions.mask[v, u].mean()
     assert (share if inside else 1 - share) > 0.9
@@ -135,7 +140,7 @@ def test_a_spread_fills_its_mask_evenly_before_it_goes_elsewhere() -> None:
 
 
 def test_the_oracle_knows_where_nothing_returns() -> None:
-    case = Case(frame(), SHAPE, SHOTS, 1, 0)
+    case = case_of(SHOTS, 1)
     shots = STRATEGIES["oracle"].pixels(case)[len(case.seed_uv) :]
     assert len(shots) > 100
     assert (case.frame.measure(shots) > 0).all()
@@ -217,25 +222,15 @@ def test_figures_are_those_of_the_definition() -> None:
 
 
 def test_frames_and_seeds_do_not_depend_on_how_many_processes(folder: Path) -> None:
-    options = {
-        "every": 2,
-        "budgets": (0.05,),
-        "rounds": 2,
-        "settings": Settings(seeds=SeedOptions(*SHAPE)),
-        "random_seeds": 2,
-        "strategies": ("random", "loop"),
-    }
-    told: list[tuple[int, int]] = []
-    alone = outcomes(
-        [str(folder)],
-        jobs=1,
-        progress=lambda a, b: told.append((a, b)),
-        **options,  # type: ignore[arg-type]
+    options = ComparisonOptions(
+        every=2, budget=(0.05,), rounds=2, random_seeds=2, strategies=("random", "loop"), jobs=1
     )
+    told: list[tuple[int, int]] = []
+    alone = outcomes([str(folder)], options, SETTINGS, lambda a, b: told.append((a, b)))
     assert told == [(0, 2), (1, 2), (2, 2), (2, 2)]
     assert [o.strategy for o in alone] == ["uniform", "random", "loop", "oracle"] * 2
     assert [len(o.errors) for o in alone] == [1, 2, 1, 1] * 2
-    assert alone == outcomes([str(folder)], jobs=2, **options)  # type: ignore[arg-type]
+    assert alone == outcomes([str(folder)], dataclasses.replace(options, jobs=2), SETTINGS)
 
 
 def test_no_more_frames_are_read_ahead_than_keep_the_processes_busy(
@@ -255,23 +250,16 @@ def test_no_more_frames_are_read_ahead_than_keep_the_processes_busy(
         done = now
 
     monkeypatch.setattr(protocol, "frames_of", frames_of)
-    found = outcomes(
-        [str(folder)] * 5,
-        every=1,
-        budgets=(0.05,),
-        settings=Settings(seeds=SeedOptions(*SHAPE)),
-        strategies=(),
-        jobs=2,
-        progress=progress,
-    )
+    options = ComparisonOptions(every=1, budget=(0.05,), strategies=(), jobs=2)
+    found = outcomes([str(folder)] * 5, options, SETTINGS, progress)
     assert read == done == len(found) / 2 > 8
 
 
 def test_selecting_pays_on_a_made_scene() -> None:
     cases = [("loop", 0.3), ("step", 0.7)]
-    uniform = protocol.run_strategy("uniform", Case(frame(), SHAPE, SHOTS, 8, 0)).rmse_mm
+    uniform = protocol.run_strategy("uniform", case_of(SHOTS, 8)).rmse_mm
     for name, most in cases:
-        found = protocol.run_strategy(name, Case(frame(), SHAPE, SHOTS, 8, 0))
+        found = protocol.run_strategy(name, case_of(SHOTS, 8))
         assert found.rmse_mm < most * uniform
 
 
@@ -297,7 +285,7 @@ def test_misuse_is_refused_in_a_sentence(
 def test_a_source_that_shows_nothing_is_refused(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "000000.png"), np.zeros((48, 64), np.uint16))
     with pytest.raises(SourceNotFoundError, match="no frame with depth"):
-        outcomes([str(tmp_path)])
+        outcomes([str(tmp_path)], ComparisonOptions(), Settings())
 
 
 def test_the_command_writes_table_file_and_picture(
@@ -360,14 +348,15 @@ def test_a_quad_tree_splits_where_the_corners_foretold_worst() -> None:
 
 
 def test_the_picture_shows_shots_and_errors(tmp_path: Path) -> None:
-    shown = comparison(frame(), 0.05, rounds=2, seeds_shape=SHAPE, strategies=("uniform", "loop"))
-    images = [axes.images[0].get_array() for axes in shown.axes]
-    assert len(images) == 4
-    for image, rounds in zip(images[:2], (1, 2), strict=True):
+    shown = comparison(case_of(960, 2))
+    images = [axes.images[0].get_array() for axes in shown.axes if axes.get_xlim()[1] == WIDTH - 0.5]
+    assert len(images) == 2 * len(TITLES)
+    at = [list(TITLES).index(name) for name in ("uniform", "loop")]
+    for image, rounds in zip((images[at[0]], images[at[1]]), (1, 2), strict=True):
         seen = {tuple(pixel) for pixel in image.reshape(-1, 3).tolist()}
         colours = palette.channels(palette.round_colours(rounds)[1:])
         assert all(tuple(colour) in seen for colour in colours.tolist())
-    brightness = [image.astype(int).sum() for image in images[2:]]
+    brightness = [images[len(TITLES) + each].astype(int).sum() for each in at]
     assert brightness[1] < brightness[0]  # the loop errs less
 
 
@@ -423,10 +412,8 @@ def test_the_model_command(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_figures_of_the_documentation_hold(shared_data: Path) -> None:
     """The targets of the project, on frames that nothing was tuned on."""
-    found = outcomes(
-        [str(shared_data / "sequence")],
-        strategies=("gradient", "improvement", "step", "loop", "uniform_x3", "uniform_70"),
-    )
+    strategies = ("gradient", "improvement", "step", "loop", "uniform_x3", "uniform_70")
+    found = outcomes([str(shared_data / "sequence")], ComparisonOptions(strategies=strategies), Settings())
     results = summarise(found)
     for budget, geo in (("0.05", 0.145), ("0.10", 0.13)):
         loop = results[budget]["loop"]
@@ -469,6 +456,6 @@ def test_over_time_a_memory_is_held_against_what_it_replaces(
 
 
 def test_over_time_a_recording_without_truth_is_held_against_itself(folder: Path) -> None:
-    courses = over_time(str(folder), 0.05, seeds_shape=SHAPE, rounds=2)
+    *_, (_, _, courses) = over_time(str(folder), ComparisonOptions(rounds=2), SETTINGS)
     assert courses["whole_frame"].rmse_mm == [0, 0, 0]
     assert all(value > 0 for value in courses["memory"].rmse_mm)
