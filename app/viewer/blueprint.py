@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import rerun as rr
 import rerun.blueprint as rrb
 
-from selective_depth.app.pictures import palette as legend
+from selective_depth.app.pictures import palette
 
 Part = rrb.Container | rrb.View
 
@@ -31,6 +33,55 @@ TITLES = {
     "space": ("In space", "the cloud, the camera and what was measured"),
 }
 """What each picture is called, and what it shows."""
+
+ENTITIES = {
+    "sensor": ("depth", "holes"),
+    "seeds": ("seeds",),
+    "gas": ("gas/mask", "gas/triangles", "gas/nodes"),
+    "score": ("improvement/score",),
+    "long": ("gas/complement",),
+    "estimate": ("improvement/estimate", "improvement/unknown"),
+    "deviation": ("errors/expected",),
+    "samples": ("samples", "holes"),
+    "known": ("memory/age", "memory/changed"),
+    "even": ("even",),
+    "model": ("model",),
+    "whole": ("depth", "holes"),
+    "truth": ("truth",),
+    "even_error": ("errors/even",),
+    "error": ("errors/selective",),
+}
+"""What is seen in each picture of the camera."""
+OVER_DEPTH = ("gas", "long")
+"""Pictures that lie over the frame in grey."""
+
+COLUMNS: dict[tuple[str, str], dict[str, float]] = {
+    ("engineer", "no budget"): {
+        "scene sensor seeds": 0.9,
+        "long estimate deviation": 0.9,
+        "gas score": 1,
+        "space": 1.7,
+    },
+    ("engineer", "budget"): {
+        "scene sensor seeds known|samples": 0.9,
+        "long estimate deviation": 0.9,
+        "gas even even_error": 1,
+        "score model error": 1,
+        "space whole truth colours|guide": 1,
+    },
+    ("visitor", "no budget"): {"scene seeds sensor": 1, "gas score": 1, "space": 1.6},
+    ("visitor", "budget"): {
+        "scene|sensor known samples": 1,
+        "even even_error": 1,
+        "model error": 1,
+        "whole truth space": 1,
+    },
+}
+"""Which pictures are under each other in each column, and how wide it is beside the others.
+
+What is measured comes first, then what is wanted; with a budget, what both models are like. Those with a bar
+between them share a place as tabs, and those that there are not leave no gap.
+"""
 
 VISITORS_GUIDE = """\
 **Both models are made of equally many measurements**: of an even lattice, and of those that a selector \
@@ -80,15 +131,19 @@ class Shown:
     @property
     def titles(self) -> dict[str, tuple[str, str]]:
         """Title and meaning of each picture that there is, by its key in `TITLES`; a visitor's have no numbers."""
-        there = {
-            "scene": self.colour and "colour" not in self.hide,
-            "gas": not (self.visitor and self.by),
+        scene = self.colour and "colour" not in self.hide
+        there: dict[str, object] = {
+            "scene": scene,
             "known": self.memory,
+            "samples": self.by and not (self.visitor and self.memory),
             "whole": self.by and not self.truth,
             "truth": self.by and self.truth,
-        } | dict.fromkeys(("samples", "even", "model", "even_error", "error"), self.by)
+        }
+        there |= dict.fromkeys(("even", "model", "even_error", "error"), self.by)
         there |= dict.fromkeys(("long", "estimate", "deviation"), self.detail and not self.visitor)
-        there["score"] = there["seeds"] = there["gas"]
+        there |= dict.fromkeys(("seeds", "gas", "score"), not (self.visitor and self.by))
+        if self.visitor and scene:
+            there["seeds"] = False
         titles = {key: words for key, words in TITLES.items() if there.get(key, True)}
         return {key: (self._title(title), meaning) for key, (title, meaning) in titles.items()}
 
@@ -123,16 +178,19 @@ class Shown:
         ]
         return "\n".join(["Measured → wanted → known.\n"] * (not self.visitor) + lines)
 
-    def legend(self, limits_mm: tuple[float, float]) -> legend.Image:
+    def legend(self, limits_mm: tuple[float, float]) -> palette.Image:
         """The colours of these pictures."""
-        scales, swatches = [legend.depth_scale(limits_mm)], [(legend.UNKNOWN, legend.HOLE)]
+        scales, swatches = [palette.depth_scale(limits_mm)], [(palette.UNKNOWN, palette.HOLE)]
         if "gas" in self.titles:
-            scales.append(legend.IMPROVEMENT)
-            swatches += [("kept triangles: regions selected", legend.REGION | 0xFF), ("neural-gas nodes", legend.NODE)]
+            scales.append(palette.IMPROVEMENT)
+            swatches += [
+                ("kept triangles: regions selected", palette.REGION | 0xFF),
+                ("neural-gas nodes", palette.NODE),
+            ]
         if self.by:
-            scales += [legend.ERROR, legend.AGE if self.memory else legend.round_scale(self.rounds)]
-        swatches += [("forgotten in this frame", legend.FORGOTTEN | 0xFF)] * self.memory
-        return legend.picture(scales, swatches, 2 if self.visitor else 1)
+            scales += [palette.ERROR, palette.AGE if self.memory else palette.round_scale(self.rounds)]
+        swatches += [("forgotten in this frame", palette.FORGOTTEN | 0xFF)] * self.memory
+        return palette.picture(scales, swatches, 2 if self.visitor else 1)
 
 
 def blueprint(shown: Shown, look_at_m: float = 2.0, limits_mm: tuple[float, float] = (500.0, 5000.0)) -> rrb.Blueprint:
@@ -148,52 +206,39 @@ def blueprint(shown: Shown, look_at_m: float = 2.0, limits_mm: tuple[float, floa
         Ends of the depth scale.
     """
     views = _views(shown, look_at_m, limits_mm)
-    parts: list[Part] = [_line()] if shown.by else []
-    shares = [0.09 if shown.visitor else 0.055] if shown.by else []
+    parts: dict[Part, float] = {}
+    if shown.by:
+        parts[_flat("/line", "The gain", titlebar=False)] = 0.09 if shown.visitor else 0.055
+    pictures = _pictures(shown, views)
     if shown.visitor:
-        parts += [_pictures_for_visitors(shown, views), rrb.Horizontal(*_colours(titlebar=False))]
-        shares += [1.0, 0.12]
+        parts |= {pictures: 1.0, rrb.Horizontal(views["colours"], views["guide"]): 0.12}
     else:
-        parts.append(
-            rrb.Horizontal(_pictures(shown, views), _figures(shown), column_shares=[4.3 if shown.detail else 3.7, 1])
-        )
-        shares.append(1.0)
-    return rrb.Blueprint(
-        rrb.Vertical(*parts, row_shares=shares),
-        rrb.TimePanel(timeline="time", play_state="following", state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        auto_views=False,
-    )
+        shares = [4.3 if shown.detail else 3.7, 1]
+        parts[rrb.Horizontal(pictures, _figures(shown, views), column_shares=shares)] = 1.0
+    time = rrb.TimePanel(timeline="time", play_state="following", state="collapsed")
+    return _framed(rrb.Vertical(*parts, row_shares=list(parts.values())), time)
+
+
+def _framed(content: Part, time: rrb.TimePanel) -> rrb.Blueprint:
+    """A layout with no other panel open than the one of the time."""
+    closed = rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")
+    return rrb.Blueprint(content, time, *closed, auto_views=False)
 
 
 def _views(shown: Shown, look_at_m: float, limits_mm: tuple[float, float]) -> dict[str, Part]:
     """A view of each picture that there is, by its key in `TITLES`."""
-    grey = _grey(limits_mm)
-    over = {"gas": grey, "long": grey}
-    contents = {
-        "sensor": ("depth", "holes"),
-        "seeds": ("seeds",),
-        "gas": ("gas/mask", *(f"gas/{layer}" for layer in ("triangles", "nodes") if layer not in shown.hide)),
-        "score": ("improvement/score",),
-        "long": ("gas/complement",),
-        "estimate": ("improvement/estimate", "improvement/unknown"),
-        "deviation": ("errors/expected",),
-        "samples": ("samples", "holes"),
-        "known": ("memory/age", "memory/changed"),
-        "even": ("even",),
-        "model": ("model",),
-        "whole": ("depth", "holes"),
-        "truth": ("truth",),
-        "even_error": ("errors/even",),
-        "error": ("errors/selective",),
-    }
     titles = {key: title for key, (title, _) in shown.titles.items()}
+    hidden, titlebar = {f"gas/{layer}" for layer in shown.hide}, not shown.visitor
     views: dict[str, Part] = {
-        key: _image(titles[key], *entities, over=over.get(key)) for key, entities in contents.items() if key in titles
+        "colours": _flat("/legend", "Colours", titlebar=titlebar),
+        "guide": rrb.TextDocumentView(origin="/guide", name="Guide", titlebar=titlebar),
     }
+    for key, entities in ENTITIES.items():
+        if key in titles:
+            seen = [entity for entity in entities if entity not in hidden]
+            views[key] = _image(titles[key], *seen, over_mm=limits_mm if key in OVER_DEPTH else None)
     if "scene" in titles:
-        views["scene"] = rrb.Spatial2DView(origin="/colour", name=titles["scene"], background=legend.BACKGROUND)
+        views["scene"] = _flat("/colour", titles["scene"])
     away_m = look_at_m * (0.4 if shown.by else 0.5)  # without a budget the view is taller than wide
     eye = rrb.EyeControls3D(
         position=(-away_m, -0.9 * away_m, look_at_m - 3 * away_m), look_target=(0, 0, look_at_m), eye_up=(0, -1, 0)
@@ -203,7 +248,7 @@ def _views(shown: Shown, look_at_m: float, limits_mm: tuple[float, float]) -> di
         contents=["/camera", *_in_space(shown)],
         name=titles["space"],
         eye_controls=eye,
-        background=legend.BACKGROUND,
+        background=palette.BACKGROUND,
     )
     return views
 
@@ -220,74 +265,34 @@ def _in_space(shown: Shown) -> list[str]:
     return [entity for layer, entities in layers.items() if layer not in shown.hide for entity in entities]
 
 
-def _columns(views: dict[str, Part], *columns: tuple[str, ...]) -> list[rrb.Vertical]:
-    """Pictures under each other, in columns; those that are not there leave no gap."""
-    return [rrb.Vertical(*(views[key] for key in column if key in views)) for column in columns]
-
-
 def _pictures(shown: Shown, views: dict[str, Part]) -> rrb.Horizontal:
-    """All of them: what is measured, then wanted; with a budget, what both models are like below."""
-    inner = [("long", "estimate", "deviation")] * shown.detail
-    if not shown.by:
-        columns = _columns(views, ("scene", "sensor", "seeds"), *inner, ("gas", "score"), ("space",))
-        return rrb.Horizontal(*columns, column_shares=[0.9, *[0.9] * len(inner), 1, 1.7])
-    if "known" in views:
-        views["samples"] = rrb.Tabs(views["known"], views["samples"])
-    views["colours"] = rrb.Tabs(*_colours())
-    last = "truth" if shown.truth else "whole"
-    columns = _columns(
-        views,
-        ("scene", "sensor", "seeds", "samples"),
-        *inner,
-        ("gas", "even", "even_error"),
-        ("score", "model", "error"),
-        ("space", last, "colours"),
-    )
-    return rrb.Horizontal(*columns, column_shares=[0.9, *[0.9] * len(inner), 1, 1, 1])
+    """Those that there are, in their `COLUMNS`."""
+    columns: dict[Part, float] = {}
+    look = "visitor" if shown.visitor else "engineer", "budget" if shown.by else "no budget"
+    for places, share in COLUMNS[look].items():
+        there = [[views[key] for key in place.split("|") if key in views] for place in places.split()]
+        column = [rrb.Tabs(*tabs) if len(tabs) > 1 else tabs[0] for tabs in there if tabs]
+        if column:
+            columns[rrb.Vertical(*column)] = share
+    return rrb.Horizontal(*columns, column_shares=list(columns.values()))
 
 
-def _pictures_for_visitors(shown: Shown, views: dict[str, Part]) -> rrb.Horizontal:
-    """Few and large: the two models side by side, or without a budget what the selectors find."""
-    if not shown.by:
-        columns = _columns(views, ("scene" if "scene" in views else "seeds", "sensor"), ("gas", "score"), ("space",))
-        return rrb.Horizontal(*columns, column_shares=[1, 1, 1.6])
-    if "scene" in views:
-        views["sensor"] = rrb.Tabs(views["scene"], views["sensor"])
-    taken, last = "known" if shown.memory else "samples", "truth" if shown.truth else "whole"
-    return rrb.Horizontal(
-        *_columns(views, ("sensor", taken), ("even", "even_error"), ("model", "error"), (last, "space"))
-    )
+def _flat(origin: str, name: str, **options: Any) -> rrb.Spatial2DView:
+    """View of what is flat, before the background that all of them have."""
+    return rrb.Spatial2DView(origin=origin, name=name, background=palette.BACKGROUND, **options)
 
 
-def _line() -> rrb.Spatial2DView:
-    return rrb.Spatial2DView(origin="/line", name="The gain", titlebar=False, background=legend.BACKGROUND)
-
-
-def _colours(titlebar: bool = True) -> list[rrb.View]:
-    """The legend and the guide."""
-    colours = rrb.Spatial2DView(origin="/legend", name="Colours", background=legend.BACKGROUND, titlebar=titlebar)
-    return [colours, rrb.TextDocumentView(origin="/guide", name="Guide", titlebar=titlebar)]
-
-
-def _image(name: str, *entities: str, over: rr.DepthImage | None = None) -> rrb.Spatial2DView:
-    """View of entities of the camera, alone or over its depth in grey."""
+def _image(name: str, *entities: str, over_mm: tuple[float, float] | None = None) -> rrb.Spatial2DView:
+    """View of entities of the camera, alone or over its depth in dim grey, given the ends of the depth scale."""
     contents = [f"/camera/{entity}" for entity in entities]
-    return rrb.Spatial2DView(
-        origin="/camera",
-        contents=contents if over is None else [*contents, "/camera/depth", "/camera/holes"],
-        overrides=None if over is None else {"/camera/depth": over},
-        background=legend.BACKGROUND,
-        name=name,
-    )
+    if over_mm is None:
+        return _flat("/camera", name, contents=contents)
+    grey = rr.DepthImage.from_fields(colormap="grayscale", depth_range=list(palette.backdrop_limits_mm(over_mm)))
+    contents += ["/camera/depth", "/camera/holes"]
+    return _flat("/camera", name, contents=contents, overrides={"/camera/depth": grey})
 
 
-def _grey(limits_mm: tuple[float, float]) -> rr.DepthImage:
-    """How depth looks below something else: dim, within a wider range."""
-    dim_range = list(legend.backdrop_limits_mm(limits_mm))
-    return rr.DepthImage.from_fields(colormap="grayscale", depth_range=dim_range)
-
-
-def _figures(shown: Shown) -> rrb.Vertical:
+def _figures(shown: Shown, views: dict[str, Part]) -> rrb.Vertical:
     """How the run fares: plots, each with its key beside it, and the sensor's state."""
 
     def plot(key: str, title: str, unit: str, names: list[str]) -> Part:
@@ -297,30 +302,24 @@ def _figures(shown: Shown) -> rrb.Vertical:
             name=title,
             plot_legend=rrb.PlotLegend(visible=False),
         )
-        beside = rrb.Spatial2DView(origin=f"/keys/{key}", titlebar=False, name=f"{title}: lines",
-                                   background=legend.BACKGROUND)  # fmt: skip
+        beside = _flat(f"/keys/{key}", f"{title}: lines", titlebar=False)
         return rrb.Horizontal(view, beside, column_shares=[2.6, 1]) if unit else view
 
     plots = [plot("stages", "Stages", "ms", ["stages"])]
     plots += [plot(key, *of) for key, of in shown.plots.items()]
     states = [rrb.StateTimelineView(origin="/sensor/state", name="Sensor")] * shown.live
-    first = [] if shown.by else [rrb.Tabs(*_colours())]
+    first = [] if shown.by else [rrb.Tabs(views["colours"], views["guide"])]
     return rrb.Vertical(*first, *plots, *states)
 
 
 def epoch_blueprint(limits_mm: tuple[float, float]) -> rrb.Blueprint:
     """Layout for trainings of several lengths: nodes, kept triangles and long edges, in space."""
-    grey = _grey(limits_mm)
     space = rrb.Spatial3DView(origin="/", contents=["/world/nodes", "/world/regions"], name="In space")
     error = rrb.TimeSeriesView(origin="/figures", name="Quantisation error in mm")
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(_image("Nodes", "gas/nodes", over=grey), _image("Long edges", "gas/complement", over=grey)),
-            _image("Kept triangles", "gas/mask", "gas/triangles", over=grey),
-            rrb.Vertical(space, error, row_shares=[2, 1]),
-        ),
-        rrb.TimePanel(timeline="epoch", state="expanded"),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        auto_views=False,
+    image = partial(_image, over_mm=limits_mm)
+    pictures = rrb.Horizontal(
+        rrb.Vertical(image("Nodes", "gas/nodes"), image("Long edges", "gas/complement")),
+        image("Kept triangles", "gas/mask", "gas/triangles"),
+        rrb.Vertical(space, error, row_shares=[2, 1]),
     )
+    return _framed(pictures, rrb.TimePanel(timeline="epoch", state="expanded"))

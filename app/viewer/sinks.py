@@ -88,10 +88,10 @@ class Place(ABC):
         """Log a step, or the sensor's state."""
         assert self._recording is not None
         if isinstance(item, SensorNote):
-            self._recording.log(item)
+            self._recording.logger.log_state(item.state)
             return
         with self.showing.times.stage("log"):
-            self._recording.log(item)
+            self._recording.logger.log(item)
 
     def close(self) -> None:
         """Send what is left and let go."""
@@ -193,8 +193,13 @@ class ServedPlace(Place):
         self.url = f"rerun+http://{host}:{self.port}/proxy"
 
     def _connect(self) -> Recording:
+        options = self.showing.options
+        origins = [options.serve_origin] if options.serve_origin else None
         try:
-            recording = Recording.to_server(self.host, self.port, *self._what)
+            target = rr.GrpcServerSink(
+                self.host, self.port, server_memory_limit=options.serve_memory, cors_allow_origin=origins
+            )
+            recording = Recording(target, *self._what)
         except RuntimeError as error:
             raise ViewerError(f"cannot serve on {self.host}:{self.port}: {error}.") from None
         deadline_s = time.monotonic() + SERVE_S
@@ -268,7 +273,7 @@ class RemotePlace(Place):
         self.showing.tell(f"The {self.name} was closed; the run goes on without it.")
 
     def _connect(self) -> Recording:
-        return Recording.to_viewer(self.url, *self._what)
+        return Recording(rr.GrpcSink(self.url), *self._what)
 
 
 class WindowPlace(RemotePlace):

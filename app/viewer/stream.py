@@ -12,10 +12,9 @@ from typing import Self
 import rerun as rr
 
 from selective_depth.app.console.output import cannot_write
-from selective_depth.app.pipeline import FrameResult, SensorNote
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.blueprint import Shown, blueprint
-from selective_depth.app.viewer.logger import StepLogger
+from selective_depth.app.viewer.logger import ResultLogger
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.neural_gas import RegionSelection
@@ -35,13 +34,18 @@ class Recording:
     Parameters
     ----------
     target : rr.FileSink, rr.GrpcSink or rr.GrpcServerSink
-        Where it goes; use `to_file`, `to_viewer` or `to_server`.
+        Where it goes; for a file use `to_file`. A viewer must be listening, or this blocks for 5 s.
     application : str
         Application id: recordings of the same one share their layout in a viewer.
     options : ViewerOptions
         What the user asked to see.
     batching : rr.ChunkBatcherConfig, optional
         How rows are put together before they are sent; by default at once, for a viewer.
+
+    Attributes
+    ----------
+    logger : ResultLogger
+        What logs into it.
     """
 
     def __init__(
@@ -59,7 +63,7 @@ class Recording:
         # The SDK imports half of what it needs at first use, which takes it up to a second:
         # that is now, and not while the first frames come.
         blueprint(Shown(by="it", detail=True))
-        self._logger = StepLogger(self._stream, options)
+        self.logger = ResultLogger(self._stream, options)
 
     @classmethod
     def to_file(cls, path: Path, application: str, options: ViewerOptions, *, index: bool) -> Self:
@@ -74,29 +78,6 @@ class Recording:
             flush_tick=timedelta(seconds=1), flush_num_bytes=1 << 20 if index else SMALL_BYTES
         )
         return cls(rr.FileSink(str(path), write_footer=index), application, options, batching)
-
-    @classmethod
-    def to_viewer(cls, url: str, application: str, options: ViewerOptions) -> Self:
-        """Send to a viewer that listens; where none does, this blocks for 5 s."""
-        return cls(rr.GrpcSink(url), application, options)
-
-    @classmethod
-    def to_server(cls, host: str, port: int, application: str, options: ViewerOptions) -> Self:
-        """Serve viewers that join."""
-        origins = [options.serve_origin] if options.serve_origin else None
-        sink = rr.GrpcServerSink(host, port, server_memory_limit=options.serve_memory, cors_allow_origin=origins)
-        return cls(sink, application, options)
-
-    def log(self, item: FrameResult | SensorNote) -> None:
-        """Log a step, or the sensor's state."""
-        if isinstance(item, SensorNote):
-            self._logger.log_state(item.state)
-        else:
-            self._logger.log(item)
-
-    def log_trainings(self, frame: DepthFrame, trainings: Iterable[tuple[int, RegionSelection]]) -> None:
-        """Log one frame's regions after trainings of several lengths."""
-        self._logger.log_trainings(frame, trainings)
 
     def flush(self, timeout_s: float = 1e9) -> bool:
         """Wait until everything is sent or written; False if it is not, in time or for good."""
@@ -150,7 +131,7 @@ def save_trainings(path: Path, frame: DepthFrame, trainings: Iterable[tuple[int,
         raise cannot_write(path, error) from None
     never_wait_at_exit()
     recording = Recording.to_file(path, f"{APPLICATION} epochs", ViewerOptions(detail=True), index=True)
-    recording.log_trainings(frame, trainings)
+    recording.logger.log_trainings(frame, trainings)
     if not recording.is_written(path):
         recording.abandon()
         if path.is_file():

@@ -31,7 +31,7 @@ from selective_depth.app.console.errors import UsageError, ViewerError
 from selective_depth.app.pictures import palette
 from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes
 from selective_depth.app.viewer import Viewer, screenshot, sinks, viewer, window
-from selective_depth.app.viewer.logger import DEPTH_COLOURS
+from selective_depth.app.viewer.logger import DEPTH_COLOURS, ResultLogger
 from selective_depth.app.viewer.stream import Recording
 from selective_depth.drivers.errors import OutputError
 
@@ -131,16 +131,16 @@ def test_a_recording_waits_for_its_file_and_a_sensor_for_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, live: bool
 ) -> None:
     go_on = threading.Event()
-    plain = Recording.log
+    plain = ResultLogger.log
 
-    def slow(self: Recording, item: FrameResult | SensorNote) -> None:
+    def slow(self: ResultLogger, item: FrameResult) -> None:
         if live:
             go_on.wait()
         else:
             time.sleep(0.05)
         plain(self, item)
 
-    monkeypatch.setattr(Recording, "log", slow)
+    monkeypatch.setattr(ResultLogger, "log", slow)
     chosen = dataclasses.replace(HEADLESS, save=tmp_path / "out.rrd")
     shown = Viewer(chosen, live=live, times=StageTimes(), frames=100)
     for index in range(20):
