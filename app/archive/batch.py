@@ -8,8 +8,10 @@ import re
 import shutil
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +23,7 @@ from selective_depth.app.archive.unit import WORK, Cut, Job, Recording, do_range
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.dispatch import sentence_of
 from selective_depth.app.console.errors import AppError, UsageError
-from selective_depth.app.console.output import cannot_write, lock, make_folder
+from selective_depth.app.console.output import lock, make_folder
 from selective_depth.app.console.tables import write_table
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.options import parted
@@ -107,8 +109,10 @@ class Batch:
         self.listed = self.done = self.skipped = self.failures = 0
         self.complete = self._unfinished = False
         self._words, self._failed = words, failed
-        self._made, self._heard = 0, {}  # type: tuple[int, dict[str, int]]
+        self._waiting: deque[Recording] = deque()
         self._trouble: BaseException | None = None
+        self._made = 0
+        self._heard: dict[str, int] = {}
         self._rows: list[dict[str, Any]] = []
         self._tables: list[pa.Table] = []
 
@@ -137,17 +141,21 @@ class Batch:
             with suppress(OSError):
                 left.unlink()
         stream = Stream(client, lambda told: self._heard.update([told]))
-        source = self._listing()
-        ends = False
-        while not ends or len(stream):
-            while not ends and not stream.full:
-                recording = next(source, None)
-                ends = recording is None and self.complete
-                if recording is None:
+        threading.Thread(target=self._list, name="listing", daemon=True).start()
+        while True:
+            complete = self.complete  # looked at first: afterwards no more come
+            while self._waiting and not stream.full:
+                recording = self._waiting.popleft()
+                stream.submit(do_recording, self.job, recording, tag=partial(self._take, stream, recording))
+            if complete and not self._waiting:
+                if self._trouble is not None:
+                    raise self._trouble
+                if not len(stream):
                     break
-                stream.submit(do_recording, self.job, recording, tag=(recording, None, -1))
-            for tag, result in stream.finished(TICK_S if len(stream) else 0.01):
-                self._take(stream, result, *tag)
+            for take, result in stream.finished(TICK_S if len(stream) else 0.01):
+                if isinstance(result, (OutputError, AppError)):
+                    raise result
+                take(result)
             interrupt.check()
             progress(stream)
         self._flush()
@@ -157,76 +165,61 @@ class Batch:
             shutil.rmtree(out / WORK, ignore_errors=True)
         return summary
 
-    def _listing(self) -> Iterator[Recording | None]:
-        """Recordings as they are found; None while the next one is not. The list waits in a file, however long."""
-        path = self.job.out / WORK / "list"
+    def _list(self) -> None:
+        """Find the recordings, while the first of them are done already."""
+        try:
+            for each in recordings(self._words, self.job.out):
+                self._waiting.append(each)
+                self.listed += 1
+        except BaseException as error:  # noqa: BLE001 - raised again where it is waited for
+            self._trouble = error
+        self.complete = True
 
-        def write() -> None:
-            try:
-                with path.open("w", encoding="utf-8", errors="surrogateescape", buffering=1) as list_:
-                    for each in recordings(self._words, self.job.out):
-                        list_.write("\0".join(each).replace("\n", "\1") + "\n")
-                        self.listed += 1
-            except OSError as error:
-                self._trouble = cannot_write(path, error)
-            except BaseException as error:  # noqa: BLE001 - raised again where it is waited for
-                self._trouble = error
-            self.complete = True
-
-        path.touch()
-        threading.Thread(target=write, name="listing", daemon=True).start()
-        with path.open(encoding="utf-8", errors="surrogateescape", newline="\n") as list_:
-            given, line = 0, ""
-            while True:
-                over = self.complete  # before the last look
-                line += list_.readline()
-                if line.endswith("\n"):
-                    yield Recording(*line[:-1].replace("\1", "\n").split("\0"))
-                    given, line = given + 1, ""
-                elif over:
-                    break
-                else:
-                    yield None
-        if self._trouble is not None:
-            raise self._trouble
-
-    def _take(self, stream: Stream, result: Any, recording: Recording, cut: Any, at: int) -> None:
-        """One call is done: a recording, or one of its ranges, or their joining."""
-        if isinstance(result, (OutputError, AppError)):
-            raise result
+    def _take(self, stream: Stream, recording: Recording, result: Any) -> None:
+        """A recording is done, or its ranges are joined, or it is to be cut."""
         if isinstance(result, Cut):
             ranges: list[Any] = [None] * len(result.starts)
-            for number in range(len(ranges)):
-                stream.submit(do_range, self.job, recording, result, number, tag=(recording, (result, ranges), number))
+            for at in range(len(ranges)):
+                take = partial(self._take_range, stream, recording, result, ranges, at)
+                stream.submit(do_range, self.job, recording, result, at, tag=take)
             return
-        if isinstance(result, Exception):
-            sentence = sentence_of(result)
-            if type(result).__name__ == "KilledWorker":
-                sentence = "its worker ended each time it was tried; is there enough memory?"
-            result = {"recording": recording.name, "source": recording.source, "state": "failed", "frames": 0}
-            result |= {"failure": sentence, "work_s": 0.0, "unfinished": True}
-            self._unfinished |= at >= 0
-        if cut is not None and at >= 0:
-            self._heard[f"{recording.name} {cut[0].starts[at]}"] = result["frames"]
-            cut[1][at] = result
-            if all(cut[1]):
-                for start in cut[0].starts:
-                    self._heard.pop(f"{recording.name} {start}", None)
-                stream.submit(join, self.job, recording, *cut, tag=(recording, cut, -1))
-            return
+        row = _row_of(recording, result)
         self._heard.pop(f"{recording.name} 0", None)
         self.done += 1
-        before = result.pop("done_before", False)
+        before = row.pop("done_before", False)
         self.skipped += before
-        self._made += 0 if before else result["frames"]
-        self._rows.append(result)
+        self._made += 0 if before else row["frames"]
+        self._rows.append(row)
         if len(self._rows) == 1000:
             self._flush()
-        if result["failure"]:
+        if row["failure"]:
             self.failures += 1
-            self._failed(result)
+            self._failed(row)
+
+    def _take_range(
+        self, stream: Stream, recording: Recording, cut: Cut, ranges: list[Any], at: int, result: Any
+    ) -> None:
+        """A range is done, perhaps the last of its recording."""
+        ranges[at] = _row_of(recording, result)
+        self._unfinished |= isinstance(result, Exception)
+        self._heard[f"{recording.name} {cut.starts[at]}"] = ranges[at]["frames"]
+        if all(ranges):
+            for start in cut.starts:
+                self._heard.pop(f"{recording.name} {start}", None)
+            stream.submit(join, self.job, recording, cut, ranges, tag=partial(self._take, stream, recording))
 
     def _flush(self) -> None:
         """Hold what is done in columns: some hundred bytes a recording."""
         self._tables.append(pa.Table.from_pylist(self._rows, schema=schema_of(SUMMARY)))
         self._rows.clear()
+
+
+def _row_of(recording: Recording, result: Any) -> dict[str, Any]:
+    """The row of the summary that a call came to, or what ended it."""
+    if not isinstance(result, Exception):
+        return dict(result)
+    sentence = sentence_of(result)
+    if type(result).__name__ == "KilledWorker":
+        sentence = "its worker ended each time it was tried; is there enough memory?"
+    row = {"recording": recording.name, "source": recording.source, "state": "failed", "frames": 0}
+    return row | {"failure": sentence, "work_s": 0.0, "unfinished": True}

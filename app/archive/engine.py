@@ -152,9 +152,9 @@ class Stream:
             self._looked_s, self.workers = time.monotonic(), sum(self._client.nthreads().values())
         return len(self._under_way) >= 2 * max(self.workers, 1) + 2
 
-    def submit(self, function: Callable[..., Any], *arguments: Any, tag: Any, priority: int = 0) -> None:
+    def submit(self, function: Callable[..., Any], *arguments: Any, tag: Any) -> None:
         """Begin a call; `tag` comes back with its result."""
-        future = self._client.submit(function, *arguments, pure=False, priority=priority)
+        future = self._client.submit(function, *arguments, pure=False)
         self._under_way[future.key] = future, tag
         future.add_done_callback(self._done.put)
 

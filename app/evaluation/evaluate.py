@@ -12,8 +12,9 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -47,7 +48,6 @@ FULL_NAMES = {
 }
 Results = dict[str, dict[str, dict[str, float]]]
 """Budget -> strategy -> figure, as the JSON file has it."""
-_Chosen = Iterator[tuple[int, DepthFrame]]
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,6 @@ def run_strategy(name: str, case: Case) -> Errors:
 
 
 _Work = Callable[[DepthFrame], list[Outcome]]
-_Keep = Callable[[int, list[Outcome]], None]
 
 
 def _evaluate_frame(
@@ -203,22 +202,20 @@ def outcomes(
     work: _Work = partial(_evaluate_frame, options, names, settings)
     total = _most(sources, options)
     found: dict[int, list[Outcome]] = {}
-
-    def keep(number: int, outcomes: list[Outcome]) -> None:
-        found[number] = outcomes
-        progress(len(found), total)
-
     progress(0, total)
-    chosen = enumerate(frames_of(sources, options.every, options.frames))
-    if options.scheduler is not None:
-        with engine(options.scheduler) as client:
+    chosen = frames_of(sources, options.every, options.frames)
+    with ExitStack() as stack:
+        if options.scheduler is not None:
+            client = stack.enter_context(engine(options.scheduler))
             workers = max(1, sum(client.nthreads().values()))
-            _through(client.get_executor(pure=False), chosen, work, workers, keep)
-    elif min(jobs, total) == 1:
-        for number, frame in chosen:
-            keep(number, work(frame))
-    else:
-        _spread(chosen, work, jobs, keep)
+            made = _through(client.get_executor(pure=False), chosen, work, workers)
+        elif min(jobs, total) == 1:
+            made = enumerate(map(work, chosen))
+        else:
+            made = _through(stack.enter_context(_processes(jobs)), chosen, work, jobs)
+        for number, of_frame in made:
+            found[number] = of_frame
+            progress(len(found), total)
     if not found:
         raise SourceNotFoundError(f"no frame with depth in {', '.join(sources)}; give another source or --every 1.")
     progress(len(found), len(found))
@@ -235,15 +232,16 @@ def _most(sources: Sequence[str], options: ComparisonOptions) -> int:
     return total
 
 
-def _spread(chosen: _Chosen, work: _Work, jobs: int, keep: _Keep) -> None:
-    """Evaluate frames in so many processes, with no more of them in memory than keep these busy."""
+@contextmanager
+def _processes(jobs: int) -> Iterator[Executor]:
+    """So many processes of this machine, each with one kernel thread."""
     # Spawned, not forked: the parent may hold threads and locks of other libraries.
     spawn = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_worker)
     done = False
     try:
-        _through(pool, chosen, work, jobs, keep)
+        yield pool
         done = True
     finally:
         if not done:  # after Ctrl-C, say: what is under way is not waited for
@@ -252,21 +250,24 @@ def _spread(chosen: _Chosen, work: _Work, jobs: int, keep: _Keep) -> None:
         pool.shutdown(wait=done, cancel_futures=True)
 
 
-def _through(pool: Executor, chosen: _Chosen, work: _Work, jobs: int, keep: _Keep) -> None:
+def _through(
+    pool: Executor, chosen: Iterable[DepthFrame], work: _Work, workers: int
+) -> Iterator[tuple[int, list[Outcome]]]:
+    """Evaluate frames, with no more of them in memory than keep the workers busy; yields them as they are done."""
     under_way: dict[Future[list[Outcome]], int] = {}
 
-    def settle() -> None:
+    def settled() -> Iterator[tuple[int, list[Outcome]]]:
         for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-            keep(under_way.pop(future), future.result())
+            yield under_way.pop(future), future.result()
 
-    for number, frame in chosen:
+    for number, frame in enumerate(chosen):
         # A worker whose start is cut short reports that nobody told it what to do.
         with interrupt.deferred(), interrupt.started_deaf():
             under_way[pool.submit(work, frame)] = number
-        if len(under_way) == 2 * jobs:
-            settle()
+        if len(under_way) == 2 * workers:
+            yield from settled()
     while under_way:
-        settle()
+        yield from settled()
 
 
 def summarise(found: Sequence[Outcome]) -> Results:

@@ -251,6 +251,5 @@ def headline(text: str) -> Image:
     return image
 
 
-def _write(image: Image, text: str, left: int, base: int, size: int = 28, weight: int = 400) -> int:
-    (end, _), _ = cv2.putText(image, text, (left, base), (225, 225, 225), _FACE, size, weight)
-    return int(end)
+def _write(image: Image, text: str, left: int, base: int, size: int = 28, weight: int = 400) -> None:
+    cv2.putText(image, text, (left, base), (225, 225, 225), _FACE, size, weight)
