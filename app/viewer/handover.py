@@ -4,27 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from typing import Generic, Protocol, TypeVar
 
-T = TypeVar("T")
-Taken = TypeVar("Taken", contravariant=True)
+from selective_depth.app.viewer.sinks import Item, Sink
 
 
-class Sink(Protocol[Taken]):
-    """Where results go. All of it is called by one and the same thread."""
-
-    def open(self) -> None:
-        """Get ready; may take its time."""
-
-    def put(self, item: Taken, /) -> None:
-        """Take one result; may block for as long as it likes."""
-
-    def close(self) -> None:
-        """Finish and let go."""
-
-
-class Handover(Generic[T]):
-    """A worker thread that feeds a sink from a short queue.
+class Handover:
+    """A worker thread that feeds a sink from a short queue; it alone calls it.
 
     A lossless hand-over waits for room, so that every item arrives. Any other waits at most
     `patience_s` for a sink that is merely slow and not at all for one that has stalled: then
@@ -32,8 +17,6 @@ class Handover(Generic[T]):
 
     Parameters
     ----------
-    name : str
-        Name of the sink, for its thread and for messages.
     sink : Sink
         Where items go.
     lossless : bool
@@ -53,24 +36,23 @@ class Handover(Generic[T]):
         What ended the sink before its time; nothing is taken any more.
     """
 
-    def __init__(self, name: str, sink: Sink[T], *, lossless: bool, patience_s: float = 0.0, capacity: int = 2) -> None:
-        self.name = name
+    def __init__(self, sink: Sink, *, lossless: bool, patience_s: float = 0.0, capacity: int = 2) -> None:
+        self.sink = sink
         self.dropped = 0
         self.failure: Exception | None = None
         self.ready = threading.Event()
-        self._sink = sink
         self._lossless = lossless
         self._patience_s = patience_s
         self._capacity = capacity
-        self._queue: deque[T] = deque()
+        self._queue: deque[Item] = deque()
         self._in_hand = 0  # 1 while the sink takes an item
         self._changed = threading.Condition()
         self._finishing = False
         self._stalled = False
-        self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
+        self._thread = threading.Thread(target=self._serve, name=sink.name, daemon=True)
         self._thread.start()
 
-    def offer(self, item: T) -> None:
+    def offer(self, item: Item) -> None:
         """Hand over an item."""
         with self._changed:
             if self._lossless:
@@ -120,11 +102,11 @@ class Handover(Generic[T]):
 
     def _serve(self) -> None:
         try:
-            self._sink.open()
+            self.sink.open()
             self.ready.set()
             while (item := self._next()) is not None:
-                self._sink.put(item)
-            self._sink.close()
+                self.sink.put(item)
+            self.sink.close()
         except Exception as error:  # noqa: BLE001 - whoever hands over must hear of it
             with self._changed:
                 self.failure = error
@@ -133,7 +115,7 @@ class Handover(Generic[T]):
                 self._changed.notify_all()
             self.ready.set()
 
-    def _next(self) -> T | None:
+    def _next(self) -> Item | None:
         with self._changed:
             self._in_hand = 0
             self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""Places where a run is seen: file, served stream, remote viewer, window; none may hold it up."""
+"""Sinks, where a run is seen: file, served stream, remote viewer, window; none may hold it up."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CHECK_EVERY_S = 1.0
 SPARE_BYTES = 64 << 20
 """Saving ends, with a whole file, when the disk has less room than this."""
 CLOSE_S = 1.0
-"""How long a place may take over its last frames."""
+"""How long a sink may take over its last frames."""
 SETTLE_S = 0.5
 CLOSING_S = 4.0
 """A window that is being closed answers for up to 1.7 s more, and lives for 2.9 s, on a busy
@@ -36,9 +36,13 @@ SERVE_S = 2.0
 """How long a server may take to listen."""
 
 
+Item = FrameResult | SensorNote
+"""What is shown: a frame's result, or the sensor's state while there is no frame."""
+
+
 @dataclass(frozen=True)
 class Showing:
-    """What all places of a run have in common.
+    """What all sinks of a run have in common.
 
     Attributes
     ----------
@@ -58,20 +62,20 @@ class Showing:
     application: str
 
 
-class Place(ABC):
-    """One place where steps go. All of it runs in one thread of its own.
+class Sink(ABC):
+    """Where the results of frames go. Once it is made, all of it runs in one thread of its own.
 
     Parameters
     ----------
     name : str
         What messages call it.
     showing : Showing
-        What all places of the run have in common.
+        What all sinks of the run have in common.
 
     Attributes
     ----------
     missed : int
-        Steps taken while nobody was there to see them.
+        Results taken while nobody was there to see them.
     """
 
     def __init__(self, name: str, showing: Showing) -> None:
@@ -81,11 +85,11 @@ class Place(ABC):
         self._recording: Recording | None = None
 
     def open(self) -> None:
-        """Open the recording, in the thread that will feed it."""
+        """Open the recording, in the thread that will feed it; may take its time."""
         self._recording = self._connect()
 
-    def put(self, item: FrameResult | SensorNote) -> None:
-        """Log a step, or the sensor's state."""
+    def put(self, item: Item) -> None:
+        """Log a frame's result, or the sensor's state; may block for as long as it likes."""
         assert self._recording is not None
         if isinstance(item, SensorNote):
             self._recording.logger.log_state(item.state)
@@ -109,14 +113,14 @@ class Place(ABC):
 
     @abstractmethod
     def _connect(self) -> Recording:
-        """Open the recording that the steps go to."""
+        """Open the recording that the results go to."""
 
 
-class FilePlace(Place):
+class FileSink(Sink):
     """Saves to an .rrd, and keeps it readable whatever happens to the disk.
 
     The SDK's writer says nothing when a write fails and never ends after it. So room is
-    checked before every step, and once a second what was written is made sure of: after a
+    checked before every result, and once a second what was written is made sure of: after a
     failure the file is cut back to there.
     """
 
@@ -141,8 +145,8 @@ class FilePlace(Place):
                 f" {SPARE_BYTES >> 20} MiB of a disk alone. Make room, or name a file elsewhere."
             )
 
-    def put(self, item: FrameResult | SensorNote) -> None:
-        """Log a step, if the disk has room for it."""
+    def put(self, item: Item) -> None:
+        """Log a result, if the disk has room for it."""
         free = shutil.disk_usage(self.path.parent).free
         if free < SPARE_BYTES:
             self.close()
@@ -183,11 +187,11 @@ class FilePlace(Place):
         self._checked_s = time.monotonic()
 
 
-class ServedPlace(Place):
+class ServedSink(Sink):
     """Serves a stream that viewers join, on this machine only unless told otherwise."""
 
     def __init__(self, showing: Showing) -> None:
-        self.host, self.port = _place_to_serve(showing.options.serve_address)
+        self.host, self.port = _address_to_serve(showing.options.serve_address)
         super().__init__(f"stream served on {self.host}:{self.port}", showing)
         host = own_address() if self.host == "0.0.0.0" else self.host
         self.url = f"rerun+http://{host}:{self.port}/proxy"
@@ -213,10 +217,10 @@ class ServedPlace(Place):
         return recording
 
 
-class RemotePlace(Place):
+class RemoteSink(Sink):
     """Sends to a viewer that is open, waits while it stalls, and finds it again if it restarts.
 
-    Each step is sent before the next is taken, so that a stalled viewer costs one step of
+    Each result is sent before the next is taken, so that a stalled viewer costs one result of
     memory, not the half gigabyte that the SDK would queue.
     """
 
@@ -227,8 +231,8 @@ class RemotePlace(Place):
         self._address = _host_and_port(url)
         self._meet()
 
-    def put(self, item: FrameResult | SensorNote) -> None:
-        """Log a step and see it off, however long the viewer takes."""
+    def put(self, item: Item) -> None:
+        """Log a result and see it off, however long the viewer takes."""
         if self._recording is None and time.monotonic() - self._checked_s > CHECK_EVERY_S:
             self._checked_s = time.monotonic()
             if self._is_back():
@@ -264,7 +268,7 @@ class RemotePlace(Place):
     def _is_back(self) -> bool:
         return listens(self._address)
 
-    def _lose(self, item: FrameResult | SensorNote) -> None:
+    def _lose(self, item: Item) -> None:
         """The viewer has gone while it was sent something."""
         self.missed += isinstance(item, FrameResult)
         self._tell_of_loss()
@@ -276,7 +280,7 @@ class RemotePlace(Place):
         return Recording(rr.GrpcSink(self.url), *self._what)
 
 
-class WindowPlace(RemotePlace):
+class WindowSink(RemoteSink):
     """Opens a viewer window, or uses the one that is open, which outlives this program."""
 
     def __init__(self, showing: Showing, taken: Container[int]) -> None:
@@ -291,8 +295,8 @@ class WindowPlace(RemotePlace):
                 self._meet()
         super().open()
 
-    def put(self, item: FrameResult | SensorNote) -> None:
-        """Log a step and see it off, however long the viewer takes."""
+    def put(self, item: Item) -> None:
+        """Log a result and see it off, however long the viewer takes."""
         self._sent += isinstance(item, FrameResult)
         super().put(item)
 
@@ -313,7 +317,7 @@ class WindowPlace(RemotePlace):
         listener = look_at(self._address[1])
         return listener is not None and listener.fits
 
-    def _lose(self, item: FrameResult | SensorNote) -> None:
+    def _lose(self, item: Item) -> None:
         if not self._window.found or time.monotonic() - self._since_s > CLOSING_S:
             super()._lose(item)
             return
@@ -336,10 +340,10 @@ def _host_and_port(url: str) -> tuple[str, int]:
     return parts.hostname, port or PORTS[0]
 
 
-def _place_to_serve(address: str | None) -> tuple[str, int]:
+def _address_to_serve(address: str | None) -> tuple[str, int]:
     """A free address to serve on (IPv4, port): the one that was asked for, or on this machine."""
     if address is None:
-        places = [("127.0.0.1", port) for port in PORTS]
+        addresses = [("127.0.0.1", port) for port in PORTS]
     else:
         host, _, port = address.rpartition(":")
         if not host or ":" in host or not port.isdecimal() or not 0 < int(port) < 65536:
@@ -347,8 +351,8 @@ def _place_to_serve(address: str | None) -> tuple[str, int]:
                 f"'{address}' is no address to serve on; write HOST:PORT, such as 127.0.0.1:9876"
                 " (the server takes no IPv6 address)."
             )
-        places = [(host, int(port))]
-    for host, number in places:
+        addresses = [(host, int(port))]
+    for host, number in addresses:
         try:
             found = socket.getaddrinfo(host, number, socket.AF_INET, socket.SOCK_STREAM)
             resolved = str(found[0][4][0])

@@ -1,4 +1,4 @@
-"""A recording stream and the one place it goes to; the SDK's ways of blocking end here."""
+"""A recording stream and the one place that it goes to; the SDK's ways of blocking end here."""
 
 from __future__ import annotations
 

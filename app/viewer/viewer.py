@@ -1,4 +1,4 @@
-"""Every place where a run is seen, each fed by a thread of its own."""
+"""Every sink where a run is seen, each fed by a thread of its own."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from collections import deque
 from pathlib import Path
 
 from selective_depth.app.console.errors import ViewerError
-from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes
+from selective_depth.app.pipeline import StageTimes
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.handover import Handover
-from selective_depth.app.viewer.sinks import FilePlace, Place, RemotePlace, ServedPlace, Showing, WindowPlace
+from selective_depth.app.viewer.sinks import FileSink, Item, RemoteSink, ServedSink, Showing, Sink, WindowSink
 from selective_depth.app.viewer.stream import APPLICATION, never_wait_at_exit
 from selective_depth.app.viewer.window import BIRTH_S, has_display
 from selective_depth.drivers.errors import OutputError
 
 READY_S = 5.0
-"""How long a place may take to open before the run begins without it."""
+"""How long a sink may take to open before the run begins without it."""
 STALL_S = 0.5
-"""A viewer that takes longer over a step has stalled; a recording waits no more."""
+"""A viewer that takes longer over a result has stalled; a recording waits no more."""
 CLOSE_ALL_S = 2.5
-"""How long all places together may take over their last frames."""
+"""How long all sinks together may take over their last frames."""
 FILE_QUEUE = 8
-"""Steps of a sensor that may wait for a file, while what was written is made sure of."""
+"""Results of a sensor's frames that may wait for a file, while what was written is made sure of."""
 INDEXED_FRAMES = 1000
 """Up to so many frames a file gets an index; beyond, its memory would be felt."""
 
 
 class Viewer:
-    """Every place where a run is seen, each fed by a thread of its own.
+    """Every sink where a run is seen, each fed by a thread of its own.
 
     Parameters
     ----------
     options : ViewerOptions
-        Which places.
+        Which sinks.
     live : bool
-        A live source waits for nobody: what a place has no time for is dropped there. A
+        A live source waits for nobody: what a sink has no time for is dropped there. A
         recording waits for its file always, and for a viewer that is not stalled.
     times : StageTimes
         Where the time that logging takes is added, as stage ``log``.
@@ -51,12 +51,12 @@ class Viewer:
     Attributes
     ----------
     options : ViewerOptions
-        Which places it came to: with the fallback as `save`, if it was needed.
+        Which sinks it came to: with the fallback as `save`, if it was needed.
 
     Raises
     ------
     OutputError, ViewerError
-        If a place cannot be written, reached or served. A window that does not start is none
+        If a sink cannot be written, reached or served. A window that does not start is none
         of these: it is told by `news`.
     """
 
@@ -74,25 +74,25 @@ class Viewer:
         self._news: deque[str] = deque()
         self._index = frames is not None and frames <= INDEXED_FRAMES
         showing = Showing(options, times, self._news.append, _application(title, options))
-        self._places: list[Place] = []
+        self._sinks: list[Sink] = []
         try:
             self._open_all(showing, fallback)
         except Exception:
-            for place in self._places:
-                if isinstance(place, FilePlace):
-                    place.discard()
+            for sink in self._sinks:
+                if isinstance(sink, FileSink):
+                    sink.discard()
             raise
-        self._fed = [(place, _handover(place, live)) for place in self._places]
+        self._ways = [_handover(sink, live) for sink in self._sinks]
         self._see_served()
 
     def _open_all(self, showing: Showing, fallback: Path | None) -> None:
         options = self.options
         if options.save is not None:
-            self._places.append(FilePlace(options.save, showing, index=self._index))
+            self._sinks.append(FileSink(options.save, showing, index=self._index))
         if options.serve:
-            self._places.append(ServedPlace(showing))
+            self._sinks.append(ServedSink(showing))
         if options.connect is not None:
-            self._places.append(RemotePlace(options.connect, showing))
+            self._sinks.append(RemoteSink(options.connect, showing))
         if options.headless or options.connect is not None:
             return
         display = has_display()
@@ -106,11 +106,11 @@ class Viewer:
     def _open_window(self, showing: Showing) -> str:
         """Open it; returns why the run cannot rely on it, in a sentence, or nothing."""
         try:
-            served = [place.port for place in self._places if isinstance(place, ServedPlace)]
-            window = WindowPlace(showing, served)
+            served = [sink.port for sink in self._sinks if isinstance(sink, ServedSink)]
+            window = WindowSink(showing, served)
         except ViewerError as error:
             return f"{str(error)[0].upper()}{str(error)[1:]}"
-        self._places.append(window)
+        self._sinks.append(window)
         return "" if window.awake else f"The viewer window has not opened within {BIRTH_S:g} s."
 
     def _save_instead(self, path: Path, showing: Showing) -> None:
@@ -120,66 +120,66 @@ class Viewer:
             raise OutputError(
                 f"'{path}' cannot be written: {error.strerror}. Name another file with --save, or none with --headless."
             ) from None
-        self._places.insert(0, FilePlace(path, showing, index=self._index))
+        self._sinks.insert(0, FileSink(path, showing, index=self._index))
         self.options = dataclasses.replace(self.options, save=path)
 
     def _see_served(self) -> None:
         """Wait until a stream that is to be served is served."""
-        for place, way in self._fed:
-            if isinstance(place, ServedPlace):
+        for way in self._ways:
+            if isinstance(way.sink, ServedSink):
                 way.ready.wait(READY_S)
                 if way.failure is not None:
                     self.close()
                     raise way.failure
 
     def news(self) -> list[str]:
-        """What has happened to the places since the last call, a sentence each."""
+        """What has happened to the sinks since the last call, a sentence each."""
         return [self._news.popleft() for _ in range(len(self._news))]
 
     @property
     def served_url(self) -> str:
         """Address at which viewers join; empty if nothing is served, or no more."""
-        for place, way in self._fed:
-            if isinstance(place, ServedPlace) and way.failure is None:
-                return place.url
+        for way in self._ways:
+            if isinstance(way.sink, ServedSink) and way.failure is None:
+                return way.sink.url
         return ""
 
     def wait_ready(self) -> None:
-        """Wait until every place is open, though for none that stalls."""
-        for _, way in self._fed:
+        """Wait until every sink is open, though for none that stalls."""
+        for way in self._ways:
             way.ready.wait(READY_S)
 
     def wait_taken(self) -> None:
-        """Wait until every place has taken all that it was handed, though for none that stalls."""
+        """Wait until every sink has taken all that it was handed, though for none that stalls."""
         deadline_s = time.monotonic() + STALL_S
-        for _, way in self._fed:
+        for way in self._ways:
             way.wait_empty(max(0.0, deadline_s - time.monotonic()))
 
-    def show(self, item: FrameResult | SensorNote) -> None:
-        """Hand a step, or the sensor's state without one, to every place.
+    def show(self, item: Item) -> None:
+        """Hand a frame's result, or the sensor's state without one, to every sink.
 
         Raises
         ------
         Exception
             What ended the file that was asked for; a viewer that is gone is no error.
         """
-        for place, way in self._fed:
+        for way in self._ways:
             way.offer(item)
-            if isinstance(place, FilePlace) and way.failure is not None:
+            if isinstance(way.sink, FileSink) and way.failure is not None:
                 raise way.failure
 
     @property
     def file_failed(self) -> bool:
         """Whether a file that was asked for ended before its time."""
-        return any(isinstance(place, FilePlace) and way.failure for place, way in self._fed)
+        return any(isinstance(way.sink, FileSink) and way.failure for way in self._ways)
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Steps that each place has missed, by its name."""
-        return {place.name: place.missed + way.dropped for place, way in self._fed}
+        """Results that each sink has missed, by its name."""
+        return {way.sink.name: way.sink.missed + way.dropped for way in self._ways}
 
     def close(self) -> list[str]:
-        """Finish every place, all of them within 3 s.
+        """Finish every sink, all of them within 3 s.
 
         Returns
         -------
@@ -189,19 +189,18 @@ class Viewer:
         never_wait_at_exit()
         deadline_s = time.monotonic() + CLOSE_ALL_S
         troubles = []
-        for _, way in self._fed:
+        for way in self._ways:
             if not way.finish(max(0.1, deadline_s - time.monotonic())):
-                troubles.append(f"the {way.name} had stalled and was left behind.")
+                troubles.append(f"the {way.sink.name} had stalled and was left behind.")
             elif way.failure is not None:
-                troubles.append(f"the {way.name} ended early: {way.failure}")
+                troubles.append(f"the {way.sink.name} ended early: {way.failure}")
         return troubles
 
 
-def _handover(place: Place, live: bool) -> Handover[FrameResult | SensorNote]:
-    file = isinstance(place, FilePlace)
+def _handover(sink: Sink, live: bool) -> Handover:
+    file = isinstance(sink, FileSink)
     return Handover(
-        place.name,
-        place,
+        sink,
         lossless=file and not live,
         patience_s=0.0 if live else STALL_S,
         capacity=FILE_QUEUE if file and live else 2,

@@ -31,7 +31,7 @@ from selective_depth.app.console.command import COMMANDS, SHELLS, parse
 from selective_depth.app.console.settings_file import to_toml
 from selective_depth.app.pipeline import save_settings
 from selective_depth.app.settings import MOST_ROUNDS, GasOptions, PlayOptions, RunOptions, Settings, ViewerOptions
-from selective_depth.app.viewer import sinks as places
+from selective_depth.app.viewer import sinks
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.open import open_source
 
@@ -451,10 +451,10 @@ def test_settings_of_a_replay_are_those_of_a_sensor_too(tmp_path: Path, monkeypa
 def test_a_save_that_fails_at_its_end_is_a_failed_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail(place: places.FilePlace, item: object) -> None:
+    def fail(sink: sinks.FileSink, item: object) -> None:
         raise OutputError("the disk went away")
 
-    monkeypatch.setattr(places.FilePlace, "put", fail)
+    monkeypatch.setattr(sinks.FileSink, "put", fail)
     out = tmp_path / "a.rrd"
     assert cli.run(["replay", ENDLESS, *QUICK, "--frames", "1", "--save", str(out)]) == 1
     shown = capsys.readouterr().out

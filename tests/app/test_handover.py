@@ -13,6 +13,8 @@ from selective_depth.app.viewer.handover import Handover
 class Gate:
     """A sink that takes items only while it is open."""
 
+    name = "gate"
+
     def __init__(self) -> None:
         self.opened = threading.Event()
         self.taken: list[int] = []
@@ -36,7 +38,7 @@ class Gate:
 def test_lossless_delivers_everything_in_order() -> None:
     gate = Gate()
     gate.opened.set()
-    handover = Handover("file", gate, lossless=True)
+    handover = Handover(gate, lossless=True)
     for item in range(500):
         handover.offer(item)
     assert handover.finish(5)
@@ -47,7 +49,7 @@ def test_lossless_delivers_everything_in_order() -> None:
 
 def test_stalled_sink_costs_items_but_no_time() -> None:
     gate = Gate()
-    handover = Handover("viewer", gate, lossless=False, capacity=2)
+    handover = Handover(gate, lossless=False, capacity=2)
     handover.offer(0)
     gate.busy.wait()
     start_s = time.monotonic()
@@ -62,7 +64,7 @@ def test_stalled_sink_costs_items_but_no_time() -> None:
 
 def test_patience_is_spent_once() -> None:
     gate = Gate()
-    handover = Handover("viewer", gate, lossless=False, patience_s=0.2, capacity=1)
+    handover = Handover(gate, lossless=False, patience_s=0.2, capacity=1)
     handover.offer(0)
     gate.busy.wait()
     start_s = time.monotonic()
@@ -75,7 +77,7 @@ def test_patience_is_spent_once() -> None:
 
 def test_slow_sink_is_waited_for() -> None:
     gate = Gate()
-    handover = Handover("viewer", gate, lossless=False, patience_s=5, capacity=1)
+    handover = Handover(gate, lossless=False, patience_s=5, capacity=1)
     threading.Timer(0.1, gate.opened.set).start()
     for item in range(50):
         handover.offer(item)
@@ -87,7 +89,7 @@ def test_slow_sink_is_waited_for() -> None:
 def test_failure_is_told_and_blocks_nobody(lossless: bool) -> None:
     gate = Gate()
     gate.opened.set()
-    handover = Handover("file", gate, lossless=lossless, capacity=1)
+    handover = Handover(gate, lossless=lossless, capacity=1)
     handover.offer(-1)
     gate.busy.wait()
     for item in range(100):
@@ -99,7 +101,7 @@ def test_failure_is_told_and_blocks_nobody(lossless: bool) -> None:
 
 def test_finish_leaves_a_stalled_sink_behind() -> None:
     gate = Gate()
-    handover = Handover("viewer", gate, lossless=False)
+    handover = Handover(gate, lossless=False)
     for item in range(3):
         handover.offer(item)
     start_s = time.monotonic()
@@ -110,7 +112,7 @@ def test_finish_leaves_a_stalled_sink_behind() -> None:
 
 def test_what_a_failed_sink_had_in_hand_and_before_it_is_dropped() -> None:
     gate = Gate()
-    handover = Handover("file", gate, lossless=False)
+    handover = Handover(gate, lossless=False)
     for item in (-1, 1, 2):
         handover.offer(item)
         gate.busy.wait()
@@ -124,7 +126,7 @@ def test_what_a_failed_sink_had_in_hand_and_before_it_is_dropped() -> None:
 def test_what_a_sink_took_before_it_failed_is_not_dropped() -> None:
     gate = Gate()
     gate.opened.set()
-    handover = Handover("file", gate, lossless=True)
+    handover = Handover(gate, lossless=True)
     for item in (1, 2, -1):
         handover.offer(item)
     assert handover.finish(5)
@@ -133,7 +135,7 @@ def test_what_a_sink_took_before_it_failed_is_not_dropped() -> None:
 
 def test_what_a_sink_left_behind_had_in_hand_and_before_it_is_dropped() -> None:
     gate = Gate()
-    handover = Handover("viewer", gate, lossless=False)
+    handover = Handover(gate, lossless=False)
     for item in range(3):
         handover.offer(item)
         gate.busy.wait()
@@ -148,14 +150,14 @@ def test_a_sink_that_does_not_open_is_waited_for_no_longer(monkeypatch: pytest.M
 
     gate = Gate()
     monkeypatch.setattr(gate, "open", refuse)
-    handover = Handover("viewer", gate, lossless=False)
+    handover = Handover(gate, lossless=False)
     assert handover.ready.wait(2)
     assert isinstance(handover.failure, OSError)
 
 
 def test_patience_is_back_after_a_stall() -> None:
     gate = Gate()
-    handover = Handover("viewer", gate, lossless=False, patience_s=0.05, capacity=1)
+    handover = Handover(gate, lossless=False, patience_s=0.05, capacity=1)
     handover.offer(0)
     gate.busy.wait()
     handover.offer(1)
