@@ -19,7 +19,6 @@ from selective_depth.app.archive import Batch, Job, engine
 from selective_depth.app.archive.batch import SUMMARY_FILE
 from selective_depth.app.archive.engine import Stream, dashboard
 from selective_depth.app.commands.model import save_depth, save_result
-from selective_depth.app.commands.snapshot import row_of
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, OK
@@ -83,7 +82,7 @@ class Keeping:
                 _save(folder / kind / name, kind, result)
             if result.frame.index in wanted:
                 title = f"{stem.name}, frame {result.frame.index}"
-                write_picture(folder / "stills" / name, contact_sheet([row_of(result, title)]))
+                write_picture(folder / "stills" / name, contact_sheet((title, result)))
             if viewer is not None:
                 result.figures.update(figures_of(result))
                 viewer.show(result)

@@ -17,7 +17,6 @@ from typing import Any
 from selective_depth.app.archive.table import FigureTable, writing
 from selective_depth.app.archive.table import row_of as figure_row
 from selective_depth.app.commands.model import save_result
-from selective_depth.app.commands.snapshot import row_of
 from selective_depth.app.commands.steering import Recording, Status, Steering, changed, unused
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
@@ -338,7 +337,7 @@ class Session:
 
         def draw() -> None:
             try:
-                write_picture(path, contact_sheet([row_of(last, title)]))
+                write_picture(path, contact_sheet((title, last)))
             except OutputError as error:
                 tell(str(error))
             else:
@@ -426,7 +425,7 @@ class Session:
         """Settings and a picture of the last frame."""
         settings_file, picture_file = beside(saved)
         save_settings(settings_file, self.settings, self._uri)
-        write_picture(picture_file, contact_sheet([row_of(last, self._title(last))]))
+        write_picture(picture_file, contact_sheet((self._title(last), last)))
         self.report.written += [saved, settings_file, picture_file]
 
 

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import IMAGES, check_picture, make_folder, write_image
 from selective_depth.app.console.progress import waiting
-from selective_depth.app.pictures import Row, StillRow, alone, contact_rows, sheet, write_picture
-from selective_depth.app.pipeline import FrameResult, Model, Pipeline, open_and_tell, say
+from selective_depth.app.pictures import Row, alone, contact_rows, sheet, write_picture
+from selective_depth.app.pipeline import FrameResult, Pipeline, open_and_tell, say
 from selective_depth.app.settings import PanelOptions, Settings
 from selective_depth.drivers.errors import SourceEndedError
 from selective_depth.drivers.frame import DepthFrame
@@ -44,25 +42,12 @@ def nth_frame(uri: str, number: int) -> DepthFrame:
     return frame
 
 
-def still_row(frame: DepthFrame, title: str, settings: Settings) -> StillRow:
+def still_of(frame: DepthFrame, settings: Settings) -> FrameResult:
     """Run both selectors, and the acquisition where there is a budget, on one frame."""
     # One frame has no frame before it to go on from.
     cold = replace(settings, gas=replace(settings.gas, training="cold"))
     with Pipeline(cold) as pipeline:
-        return row_of(pipeline.make(frame), title)
-
-
-def row_of(result: FrameResult, title: str) -> StillRow:
-    """A frame's result as a row of a contact sheet, an even lattice's model of the frame beside its own."""
-    frame, acquisition = result.frame, result.acquisition
-    if acquisition is None:
-        return StillRow(title, frame, result.regions, result.improvement)
-    selective_mm = acquisition.reconstruct() if result.model is None else result.model.depth_mm
-    models = (("even", Model.of_even(frame, len(acquisition.uv)).depth_mm), ("selective", selective_mm))
-    exact = None
-    if result.memory is not None and frame.truth_mm is not None:
-        exact = replace(frame, depth_mm=np.where(frame.depth_mm > 0, frame.truth_mm, np.uint16(0)))
-    return StillRow(title, frame, result.regions, result.improvement, acquisition, models, exact)
+        return pipeline.make(frame)
 
 
 def is_folder(out: Path) -> bool:
@@ -155,8 +140,7 @@ def snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings,
     for at, (uri, name) in enumerate(zip(sources, names, strict=True)):
         again = names[:at].count(name)
         stems.append(f"{name}-{again + 1}-" if again else f"{name}-")
-        frame = nth_frame(uri, number)
-        rows.append(still_row(frame, f"{stems[-1][:-1]}, frame {number}", settings))
+        rows.append((f"{stems[-1][:-1]}, frame {number}", still_of(nth_frame(uri, number), settings)))
     return write_all(out, "sheet", contact_rows(rows), stems, page)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from selective_depth.app.pictures import palette
 from selective_depth.app.pictures.palette import Image, Scale
+from selective_depth.app.pipeline import FrameResult, Model
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import Acquisition
 from selective_depth.selectors.improvement import ImprovementSelection
@@ -19,31 +20,6 @@ from selective_depth.selectors.neural_gas import RegionSelection
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-
-@dataclass(frozen=True)
-class StillRow:
-    """One source of a contact sheet: what was seen and what each method made of it.
-
-    Parameters
-    ----------
-    title : str
-        Above the row.
-    frame, regions, improvement, acquisition
-        What was seen, selected and, with a budget, measured.
-    models : sequence of (str, float32 array of shape (height, width))
-        Dense models in millimetres, by name, whose errors are shown.
-    exact : DepthFrame or None
-        What they are held against; by default the frame.
-    """
-
-    title: str
-    frame: DepthFrame
-    regions: RegionSelection
-    improvement: ImprovementSelection
-    acquisition: Acquisition | None = None
-    models: Sequence[tuple[str, npt.NDArray[np.float32]]] = ()
-    exact: DepthFrame | None = None
 
 
 @dataclass(frozen=True)
@@ -199,16 +175,24 @@ def error_panel(frame: DepthFrame, model_mm: npt.NDArray[np.float32], caption: s
     return Panel(name, caption, image, palette.ERROR, note)
 
 
-def panels_of(row: StillRow) -> list[Panel]:
-    """Every panel of one source, left to right."""
-    scene = scene_panel(row.frame)
+def panels_of(result: FrameResult) -> list[Panel]:
+    """Every panel of a frame, left to right: with a budget, the error of an even lattice's model and of its own too."""
+    frame, acquisition = result.frame, result.acquisition
+    scene = scene_panel(frame)
     shown = [scene] if scene is not None else []
-    shown += [depth_panel(row.frame), regions_panel(row.frame, row.regions), improvement_panel(row.improvement)]
-    if row.acquisition is not None:
-        shown.append(samples_panel(row.frame, row.acquisition))
-    for name, model_mm in row.models:
-        shown.append(error_panel(row.exact or row.frame, model_mm, f"Error, {name}", f"error-{name}"))
-    return shown
+    shown += [depth_panel(frame), regions_panel(frame, result.regions), improvement_panel(result.improvement)]
+    if acquisition is None:
+        return shown
+    shown.append(samples_panel(frame, acquisition))
+    even_mm = Model.of_even(frame, len(acquisition.uv)).depth_mm
+    selective_mm = acquisition.reconstruct() if result.model is None else result.model.depth_mm
+    if result.memory is not None and frame.truth_mm is not None:  # which its errors are held against
+        frame = replace(frame, depth_mm=np.where(frame.depth_mm > 0, frame.truth_mm, np.uint16(0)))
+    return [
+        *shown,
+        error_panel(frame, even_mm, "Error, even", "error-even"),
+        error_panel(frame, selective_mm, "Error, selective", "error-selective"),
+    ]
 
 
 def hexadecimal(colour: int) -> str:

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from selective_depth.app.console.output import write_output
 from selective_depth.app.pictures import palette
-from selective_depth.app.pictures.panels import Panel, StillRow, hexadecimal, panels_of
+from selective_depth.app.pictures.panels import Panel, hexadecimal, panels_of
+from selective_depth.app.pipeline import FrameResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,17 +34,18 @@ Row = tuple[str, Sequence[Panel | None]]
 """A title, and panels from left to right; None leaves a place empty."""
 
 
-def contact_rows(rows: Sequence[StillRow]) -> list[Row]:
-    """All sources under each other, like Fig. 5 of the paper; at least one."""
-    coloured = any(row.frame.colour is not None for row in rows)
+def contact_rows(results: Sequence[tuple[str, FrameResult]]) -> list[Row]:
+    """Frames with their titles, at least one, under each other, like Fig. 5 of the paper."""
+    coloured = any(result.frame.colour is not None for _, result in results)
     # Where one row has a scene, one without keeps its place: columns stay what they are.
-    gaps = [[None] * (coloured and row.frame.colour is None) for row in rows]
-    return [(row.title, [*gap, *panels_of(row)]) for row, gap in zip(rows, gaps, strict=True)]
+    return [
+        (title, [*[None] * (coloured and result.frame.colour is None), *panels_of(result)]) for title, result in results
+    ]
 
 
-def contact_sheet(rows: Sequence[StillRow], width_in: float = WIDTH_IN) -> Figure:
+def contact_sheet(*results: tuple[str, FrameResult]) -> Figure:
     """A `sheet` of `contact_rows`."""
-    return sheet(contact_rows(rows), width_in)
+    return sheet(contact_rows(results))
 
 
 def sheet(rows: Sequence[Row], width_in: float = WIDTH_IN, *, legend: bool = True) -> Figure:

@@ -55,29 +55,24 @@ ENTITIES = {
 OVER_DEPTH = ("gas", "long")
 """Pictures that lie over the frame in grey."""
 
-COLUMNS: dict[tuple[str, str], dict[str, float]] = {
-    ("engineer", "no budget"): {
-        "scene sensor seeds": 0.9,
-        "long estimate deviation": 0.9,
-        "gas score": 1,
-        "space": 1.7,
-    },
-    ("engineer", "budget"): {
+COLUMNS: dict[tuple[str, bool], dict[str, float]] = {
+    ("engineer", False): {"scene sensor seeds": 0.9, "long estimate deviation": 0.9, "gas score": 1, "space": 1.7},
+    ("engineer", True): {
         "scene sensor seeds known|samples": 0.9,
         "long estimate deviation": 0.9,
         "gas even even_error": 1,
         "score model error": 1,
         "space whole truth colours|guide": 1,
     },
-    ("visitor", "no budget"): {"scene seeds sensor": 1, "gas score": 1, "space": 1.6},
-    ("visitor", "budget"): {
+    ("visitor", False): {"scene seeds sensor": 1, "gas score": 1, "space": 1.6},
+    ("visitor", True): {
         "scene|sensor known samples": 1,
         "even even_error": 1,
         "model error": 1,
         "whole truth space": 1,
     },
 }
-"""Which pictures are under each other in each column, and how wide it is beside the others.
+"""By layout, and whether a budget is spent: the pictures of each column, and how wide it is beside the others.
 
 What is measured comes first, then what is wanted; with a budget, what both models are like. Those with a bar
 between them share a place as tabs, and those that there are not leave no gap.
@@ -268,8 +263,8 @@ def _in_space(shown: Shown) -> list[str]:
 def _pictures(shown: Shown, views: dict[str, Part]) -> rrb.Horizontal:
     """Those that there are, in their `COLUMNS`."""
     columns: dict[Part, float] = {}
-    look = "visitor" if shown.visitor else "engineer", "budget" if shown.by else "no budget"
-    for places, share in COLUMNS[look].items():
+    layout = "visitor" if shown.visitor else "engineer"
+    for places, share in COLUMNS[layout, bool(shown.by)].items():
         there = [[views[key] for key in place.split("|") if key in views] for place in places.split()]
         column = [rrb.Tabs(*tabs) if len(tabs) > 1 else tabs[0] for tabs in there if tabs]
         if column:

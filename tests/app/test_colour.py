@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 
 from selective_depth.app.cli import run
 from selective_depth.app.commands.model import save_cloud
-from selective_depth.app.commands.snapshot import still_row
+from selective_depth.app.commands.snapshot import still_of
 from selective_depth.app.pictures import contact_sheet, panels_of
 from selective_depth.app.settings import SeedOptions, Settings
 from selective_depth.drivers import open_source
@@ -77,7 +77,7 @@ def test_an_unregistered_image_is_shown_but_colours_no_cloud(tmp_path: Path) -> 
 @pytest.mark.parametrize(("how", "names"), [("on", ["scene", "depth"]), ("off", ["depth", "neural-gas"])])
 def test_stills_have_a_scene_where_there_is_one(how: str, names: list[str]) -> None:
     with open_source(f"{SCENE}&colour={how}") as source:
-        row = still_row(source.read(), "ball", SMALL)
+        row = still_of(source.read(), SMALL)
     panels = panels_of(row)
     assert [panel.name for panel in panels][:2] == names
     if how == "on":
@@ -88,8 +88,8 @@ def test_a_sheet_keeps_its_columns_where_one_source_has_no_colour() -> None:
     rows = []
     for how in ("on", "off"):
         with open_source(f"{SCENE}&colour={how}") as source:
-            rows.append(still_row(source.read(), how, SMALL))
-    figure = contact_sheet(rows)
+            rows.append((how, still_of(source.read(), SMALL)))
+    figure = contact_sheet(*rows)
     captions = [text.get_text() for axes in figure.axes for text in axes.texts]
     assert captions.count("Scene") == 1 and captions.count("Depth") == 2
     lefts = [axes.get_position().x0 for axes in figure.axes if any(t.get_text() == "Depth" for t in axes.texts)]

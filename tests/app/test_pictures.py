@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from selective_depth.app.commands.snapshot import row_of, short_name, snapshot, still_row
+from selective_depth.app.commands.snapshot import short_name, snapshot, still_of
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.pictures import StillRow, contact_sheet, palette, write_picture
+from selective_depth.app.pictures import contact_rows, contact_sheet, palette, write_picture
 from selective_depth.app.pictures import panels as parts
 from selective_depth.app.pictures import sheet as parts_sheet
 from selective_depth.app.pictures.palette import Scale
-from selective_depth.app.pipeline import Pipeline
+from selective_depth.app.pipeline import FrameResult, Pipeline
 from selective_depth.app.settings import AcquireOptions, GasOptions, PanelOptions, Settings
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.folder import write_folder
@@ -43,15 +43,15 @@ def step_frame() -> DepthFrame:
 
 
 @pytest.fixture(scope="module")
-def row() -> StillRow:
-    return still_row(step_frame(), "box", SMALL)
+def row() -> FrameResult:
+    return still_of(step_frame(), SMALL)
 
 
 def hexadecimal(colour: int) -> tuple[int, ...]:
     return tuple(palette.channels(colour).tolist())
 
 
-def test_every_panel_has_the_size_of_the_frame(row: StillRow) -> None:
+def test_every_panel_has_the_size_of_the_frame(row: FrameResult) -> None:
     made = parts.panels_of(row)
     names = ["depth", "neural-gas", "improvement", "acquired", "error-even", "error-selective"]
     assert [panel.name for panel in made] == names
@@ -60,7 +60,7 @@ def test_every_panel_has_the_size_of_the_frame(row: StillRow) -> None:
         assert panel.image.dtype == np.uint8
 
 
-def test_holes_have_a_colour_that_no_depth_and_no_score_has(row: StillRow) -> None:
+def test_holes_have_a_colour_that_no_depth_and_no_score_has(row: FrameResult) -> None:
     hole = np.array(hexadecimal(palette.HOLE))
     image = parts.depth_panel(row.frame).image
     assert (image[30:50, 30:50] == hole).all()
@@ -70,7 +70,7 @@ def test_holes_have_a_colour_that_no_depth_and_no_score_has(row: StillRow) -> No
         assert away.min() > 25, name
 
 
-def test_near_is_darker_than_far_as_in_the_viewer(row: StillRow) -> None:
+def test_near_is_darker_than_far_as_in_the_viewer(row: FrameResult) -> None:
     grey = cv2.cvtColor(parts.depth_panel(row.frame).image, cv2.COLOR_RGB2GRAY)
     assert grey[120, 160] < grey[200, 300] - 40
 
@@ -98,12 +98,12 @@ def test_no_two_quantities_share_colours() -> None:
     assert palette.round_scale(3).colormap == palette.AGE.colormap  # both tell when something was measured
 
 
-def test_the_map_is_brightest_along_the_step(row: StillRow) -> None:
+def test_the_map_is_brightest_along_the_step(row: FrameResult) -> None:
     image = parts.improvement_panel(row.improvement).image.astype(int).sum(axis=2)
     assert image[120, 114:126].max() > image[120, 150:170].max() + 100
 
 
-def test_shots_are_drawn_where_they_were_made(row: StillRow) -> None:
+def test_shots_are_drawn_where_they_were_made(row: FrameResult) -> None:
     assert row.acquisition is not None
     image = parts.samples_panel(row.frame, row.acquisition).image
     colours = {hexadecimal(int(colour)) for colour in palette.round_colours(2)[1:]}
@@ -122,21 +122,21 @@ def test_depth_limits_are_whole_half_metres() -> None:
 
 def test_a_frame_without_depth_can_be_drawn(tmp_path: Path) -> None:
     blank = DepthFrame(np.zeros((240, 320), np.uint16), 0, 0, Camera.kinect(320, 240))
-    write_picture(tmp_path / "a.png", contact_sheet([still_row(blank, "nothing", SMALL)]))
+    write_picture(tmp_path / "a.png", contact_sheet(("nothing", still_of(blank, SMALL))))
     sheet = cv2.imread(str(tmp_path / "a.png"))
     assert sheet is not None and sheet.shape[1] == 1600
 
 
-def drawings(row: StillRow) -> dict[str, Figure]:
+def drawings(row: FrameResult) -> dict[str, Figure]:
     """Sheets with few and many panels, and every panel alone."""
     scene = np.zeros((*row.frame.shape, 3), np.uint8)
-    coloured = replace(row, frame=replace(row.frame, colour=scene, registered=True), title="walk.oni, frame 12")
-    few = replace(row, acquisition=None, models=())
-    alone = {panel.name: parts_sheet([(coloured.title, [panel])], 5.3) for panel in parts.panels_of(coloured)}
-    return {"few": contact_sheet([few]), "many": contact_sheet([coloured]), **alone}
+    coloured = replace(row, frame=replace(row.frame, colour=scene, registered=True))
+    title, few = "walk.oni, frame 12", replace(row, acquisition=None)
+    alone = {panel.name: parts_sheet([(title, [panel])], 5.3) for panel in parts.panels_of(coloured)}
+    return {"few": contact_sheet(("box", few)), "many": contact_sheet((title, coloured)), **alone}
 
 
-def test_no_text_leaves_the_page_or_runs_into_another(row: StillRow) -> None:
+def test_no_text_leaves_the_page_or_runs_into_another(row: FrameResult) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.text import Text
 
@@ -157,7 +157,7 @@ def test_no_text_leaves_the_page_or_runs_into_another(row: StillRow) -> None:
                 assert not box.overlaps(boxes[other]), (name, texts[at], texts[other])
 
 
-def test_errors_are_those_of_as_many_measurements_spread_evenly_and_by_selection(row: StillRow) -> None:
+def test_errors_are_those_of_as_many_measurements_spread_evenly_and_by_selection(row: FrameResult) -> None:
     assert row.acquisition is not None
     even, selective = parts.panels_of(row)[-2:]
     assert even.scale is selective.scale is palette.ERROR
@@ -175,20 +175,19 @@ def test_errors_are_those_of_as_many_measurements_spread_evenly_and_by_selection
 def test_with_a_memory_the_model_and_the_truth_are_the_memorys() -> None:
     with open_source("virtual:ball?size=320x240&speed=0&frames=4") as source, Pipeline(REMEMBERING) as pipeline:
         results = [pipeline.make(frame) for frame in source]
-    row = row_of(results[-1], "still")
     truth_mm, model = results[-1].frame.truth_mm, results[-1].model
     assert truth_mm is not None and model is not None
     seen = (results[-1].frame.depth_mm > 0) & (truth_mm > 0)
     rmse_mm = np.sqrt(np.mean((model.depth_mm - truth_mm)[seen] ** 2))
-    assert f"RMSE {rmse_mm:.1f}," in parts.panels_of(row)[-1].note
+    assert f"RMSE {rmse_mm:.1f}," in parts.panels_of(results[-1])[-1].note
     assert model.truth_rmse_mm == pytest.approx(rmse_mm, rel=1e-4)
 
 
-def test_the_ending_is_the_format_and_size_and_resolution_are_as_asked(row: StillRow, tmp_path: Path) -> None:
+def test_the_ending_is_the_format_and_size_and_resolution_are_as_asked(row: FrameResult, tmp_path: Path) -> None:
     begins = {"pdf": b"%PDF", "svg": b"<?xml", "webp": b"RIFF", "png": b"\x89PNG"}
     for ending, begin in begins.items():
         path = tmp_path / f"a.{ending}"
-        write_picture(path, contact_sheet([row], 8.0), 150)
+        write_picture(path, parts_sheet(contact_rows([("box", row)]), 8.0), 150)
         assert path.read_bytes().startswith(begin)
     sheet = cv2.imread(str(tmp_path / "a.png"))
     assert sheet is not None and sheet.shape[1] == 8 * 150
