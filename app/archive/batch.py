@@ -46,7 +46,7 @@ def recordings(words: Iterable[str], out: Path | None = None) -> Iterator[Record
     Raises
     ------
     UsageError
-        If a pattern fits nothing.
+        If nothing matches a pattern.
     """
     named: set[str] = set()
     known: set[str] = set()
@@ -76,7 +76,7 @@ def _expanded(words: Iterable[str]) -> Iterator[str]:
             pattern, options = re.fullmatch(r"(.*?)(\?\w+=.*)?", word, re.S).groups("")  # type: ignore[union-attr]
             matched = sorted(glob.iglob(pattern, recursive=True))  # noqa: PTH207 - it may be absolute
             if not matched:
-                raise UsageError(f"nothing fits '{pattern}'; check the pattern.")
+                raise UsageError(f"nothing matches '{pattern}'; check the pattern.")
             yield from (each + options for each in matched)
 
 

@@ -129,18 +129,17 @@ class Stream:
     ----------
     client : Client
         Of the cluster.
-    heard : callable, optional
+    heard : callable
         Called, in another thread, with what the functions `tell`.
     """
 
-    def __init__(self, client: Client, heard: Callable[[Any], None] | None = None) -> None:
+    def __init__(self, client: Client, heard: Callable[[Any], None]) -> None:
         self._client = client
         self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._under_way: dict[str, tuple[Future, Any]] = {}
         self._looked_s = -PATIENCE_S
         self.workers = 0
-        if heard is not None:
-            client.subscribe_topic(TOPIC, lambda event: heard(event[1]))
+        client.subscribe_topic(TOPIC, lambda event: heard(event[1]))
 
     def __len__(self) -> int:
         return len(self._under_way)

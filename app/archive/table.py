@@ -143,18 +143,18 @@ def found_done(path: Path, key: str) -> dict[str, Any] | None:
     Raises
     ------
     OutputError
-        If what is there is none of ours, or was written by a newer version.
+        If what is there is not a table of `batch`, or was written by a newer version.
     """
     if not path.exists():
         return None
     said = metadata_of(path)
     if said is None or "key" not in said:
         raise OutputError(
-            f"'{path}' is no table that batch wrote; move it away, name another --out, or replace it with --force."
+            f"'{path}' is not a table that batch wrote; move it away, name another --out, or replace it with --force."
         )
     if int(said["schema"]) > SCHEMA:
         raise OutputError(
-            f"'{path}' has schema {said['schema']}, of selective-depth {said['version']}; this version knows"
+            f"'{path}' has schema {said['schema']}, of selective-depth {said['version']}; this version reads"
             f" {SCHEMA} and older. Update it, name another --out, or replace it with --force."
         )
     return json.loads(said["summary"]) if said["key"] == key else None

@@ -168,7 +168,7 @@ def take_screenshot(
     UsageError
         If the picture is of a format that cannot be made, or there is no such frame, time or view.
     ViewerError
-        If the file is no Rerun recording, or the viewer does not run here.
+        If the file is not a Rerun recording, or the viewer does not run here.
     OutputError
         If the picture cannot be written.
     """

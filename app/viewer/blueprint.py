@@ -13,45 +13,34 @@ from selective_depth.app.pictures import palette
 
 Part = rrb.Container | rrb.View
 
-TITLES = {
-    "scene": ("Scene", "what a colour camera sees"),
-    "sensor": ("1 Sensor", "every pixel of the frame"),
-    "seeds": ("2 Seeds", "the lattice that is measured first: all that the selectors know"),
-    "gas": ("3a Neural gas", "nodes settle on surfaces; triangles whose edges are short are the regions it selects"),
-    "score": ("3b Improvement", "where one more measurement would help"),
-    "long": ("3a Edges", "the triangles that are left out: steps between surfaces"),
-    "estimate": ("3b Estimate", "kriged depth between the seeds"),
-    "deviation": ("3b Deviation", "how far that is expected to be off"),
-    "samples": ("4 By {by}", "what was measured besides, where this selector wanted it, round by round"),
-    "known": ("4 Known, by age", "all that is known, bright where just measured; red where forgotten"),
-    "even": ("5 Even lattice", "the model of as many measurements, spread evenly"),
-    "model": ("5 Selective", "the model of those that were selected"),
-    "whole": ("5 Whole frame", "what the sensor measures with all its pixels"),
-    "truth": ("5 Truth", "what a perfect sensor would measure"),
-    "even_error": ("5 Error, even", "how far the even lattice's model is off"),
-    "error": ("5 Error, selective", "how far the selective one is off, on the same scale"),
-    "space": ("In space", "the cloud, the camera and what was measured"),
+PICTURES = {
+    "scene": ("Scene", "", "what a colour camera sees"),
+    "sensor": ("1 Sensor", "depth holes", "every pixel of the frame"),
+    "seeds": ("2 Seeds", "seeds", "the lattice that is measured first: all that the selectors know"),
+    "gas": (
+        "3a Neural gas",
+        "gas/mask gas/triangles gas/nodes",
+        "nodes settle on surfaces; triangles whose edges are short are the regions it selects",
+    ),
+    "score": ("3b Improvement", "improvement/score", "where one more measurement would help"),
+    "long": ("3a Edges", "gas/complement", "the triangles that are left out: steps between surfaces"),
+    "estimate": ("3b Estimate", "improvement/estimate improvement/unknown", "kriged depth between the seeds"),
+    "deviation": ("3b Deviation", "errors/expected", "how far that is expected to be off"),
+    "samples": ("4 By {by}", "samples holes", "what was measured besides, where this selector wanted it, by round"),
+    "known": (
+        "4 Known, by age",
+        "memory/age memory/changed",
+        "all that is known, bright where just measured; red where forgotten",
+    ),
+    "even": ("5 Even lattice", "even", "the model of as many measurements, spread evenly"),
+    "model": ("5 Selective", "model", "the model of those that were selected"),
+    "whole": ("5 Whole frame", "depth holes", "what the sensor measures with all its pixels"),
+    "truth": ("5 Truth", "truth", "what a perfect sensor would measure"),
+    "even_error": ("5 Error, even", "errors/even", "how far the even lattice's model is off"),
+    "error": ("5 Error, selective", "errors/selective", "how far the selective one is off, on the same scale"),
+    "space": ("In space", "", "the cloud, the camera and what was measured"),
 }
-"""What each picture is called, and what it shows."""
-
-ENTITIES = {
-    "sensor": ("depth", "holes"),
-    "seeds": ("seeds",),
-    "gas": ("gas/mask", "gas/triangles", "gas/nodes"),
-    "score": ("improvement/score",),
-    "long": ("gas/complement",),
-    "estimate": ("improvement/estimate", "improvement/unknown"),
-    "deviation": ("errors/expected",),
-    "samples": ("samples", "holes"),
-    "known": ("memory/age", "memory/changed"),
-    "even": ("even",),
-    "model": ("model",),
-    "whole": ("depth", "holes"),
-    "truth": ("truth",),
-    "even_error": ("errors/even",),
-    "error": ("errors/selective",),
-}
-"""What is seen in each picture of the camera."""
+"""What each picture is called, the entities of the camera that are seen in it, and what it shows."""
 OVER_DEPTH = ("gas", "long")
 """Pictures that lie over the frame in grey."""
 
@@ -125,7 +114,7 @@ class Shown:
 
     @property
     def titles(self) -> dict[str, tuple[str, str]]:
-        """Title and meaning of each picture that there is, by its key in `TITLES`; a visitor's have no numbers."""
+        """Title and meaning of each picture that there is, by its key in `PICTURES`; a visitor's have no numbers."""
         scene = self.colour and "colour" not in self.hide
         there: dict[str, object] = {
             "scene": scene,
@@ -139,8 +128,9 @@ class Shown:
         there |= dict.fromkeys(("seeds", "gas", "score"), not (self.visitor and self.by))
         if self.visitor and scene:
             there["seeds"] = False
-        titles = {key: words for key, words in TITLES.items() if there.get(key, True)}
-        return {key: (self._title(title), meaning) for key, (title, meaning) in titles.items()}
+        return {
+            key: (self._title(title), meaning) for key, (title, _, meaning) in PICTURES.items() if there.get(key, True)
+        }
 
     @property
     def plots(self) -> dict[str, tuple[str, str, list[str]]]:
@@ -221,17 +211,16 @@ def _framed(content: Part, time: rrb.TimePanel) -> rrb.Blueprint:
 
 
 def _views(shown: Shown, look_at_m: float, limits_mm: tuple[float, float]) -> dict[str, Part]:
-    """A view of each picture that there is, by its key in `TITLES`."""
+    """A view of each picture that there is, by its key in `PICTURES`."""
     titles = {key: title for key, (title, _) in shown.titles.items()}
     hidden, titlebar = {f"gas/{layer}" for layer in shown.hide}, not shown.visitor
     views: dict[str, Part] = {
         "colours": _flat("/legend", "Colours", titlebar=titlebar),
         "guide": rrb.TextDocumentView(origin="/guide", name="Guide", titlebar=titlebar),
     }
-    for key, entities in ENTITIES.items():
-        if key in titles:
-            seen = [entity for entity in entities if entity not in hidden]
-            views[key] = _image(titles[key], *seen, over_mm=limits_mm if key in OVER_DEPTH else None)
+    for key, title in titles.items():
+        if entities := [entity for entity in PICTURES[key][1].split() if entity not in hidden]:
+            views[key] = _image(title, *entities, over_mm=limits_mm if key in OVER_DEPTH else None)
     if "scene" in titles:
         views["scene"] = _flat("/colour", titles["scene"])
     away_m = look_at_m * (0.4 if shown.by else 0.5)  # without a budget the view is taller than wide

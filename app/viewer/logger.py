@@ -59,7 +59,7 @@ class ResultLogger:
         if self._shown is None:
             self._log_static(result)
         else:
-            # A clock that stands, or that a recording played again sets back, is helped on.
+            # Time goes on even where a clock stands still, or jumps back when a recording is played again.
             gone_us = result.frame.timestamp_us - self._timestamp_us
             self._elapsed_s += (gone_us if gone_us > 0 else USUAL_US) / 1e6
         self._timestamp_us, self._logged_s = result.frame.timestamp_us, time.monotonic()

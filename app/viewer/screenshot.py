@@ -74,7 +74,7 @@ def screenshot(
         raise ViewerError(f"'{recording}' cannot be shown: {error.strerror}.") from None
     if magic != _MAGIC:
         raise ViewerError(
-            f"'{recording}' is no Rerun recording; 'selective-depth replay SOURCE --save FILE.rrd' makes one."
+            f"'{recording}' is not a Rerun recording; 'selective-depth replay SOURCE --save FILE.rrd' makes one."
         )
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = int(free.getsockname()[1])

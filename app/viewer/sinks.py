@@ -141,8 +141,8 @@ class FileSink(Sink):
         if free < 2 * SPARE_BYTES:
             self.discard()
             raise OutputError(
-                f"'{path}' cannot be written: {free >> 20} MiB are free there, and a run leaves"
-                f" {SPARE_BYTES >> 20} MiB of a disk alone. Make room, or name a file elsewhere."
+                f"'{path}' cannot be written: {free >> 20} MiB are free there, and a run keeps"
+                f" {SPARE_BYTES >> 20} MiB of a disk free. Make room, or name a file elsewhere."
             )
 
     def put(self, item: Item) -> None:
@@ -151,8 +151,8 @@ class FileSink(Sink):
         if free < SPARE_BYTES:
             self.close()
             raise OutputError(
-                f"the disk is full ({free >> 20} MiB free). '{self.path}' was ended and is whole as"
-                " far as it goes; make room and run it again."
+                f"the disk is full ({free >> 20} MiB free). '{self.path}' was closed early and can be"
+                " opened as far as it goes; make room and run it again."
             )
         super().put(item)
         if time.monotonic() - self._checked_s > CHECK_EVERY_S:
@@ -232,7 +232,7 @@ class RemoteSink(Sink):
         self._meet()
 
     def put(self, item: Item) -> None:
-        """Log a result and see it off, however long the viewer takes."""
+        """Log a result and wait until it is sent, however long the viewer takes."""
         if self._recording is None and time.monotonic() - self._checked_s > CHECK_EVERY_S:
             self._checked_s = time.monotonic()
             if self._is_back():
@@ -258,7 +258,7 @@ class RemoteSink(Sink):
         if listener is None:
             raise ViewerError(f"no viewer listens at {self.url}. Start one there with 'rerun', or leave out --connect.")
         if not listener.rerun:
-            raise ViewerError(f"what listens at {self.url} is {listener.name}, no Rerun viewer.")
+            raise ViewerError(f"what listens at {self.url} is {listener.name}, not a Rerun viewer.")
         if not listener.fits:
             self.showing.tell(
                 f"What listens at {self.url} is {listener.name}; views may stay empty in any other"
@@ -296,7 +296,7 @@ class WindowSink(RemoteSink):
         super().open()
 
     def put(self, item: Item) -> None:
-        """Log a result and see it off, however long the viewer takes."""
+        """Log a result and wait until it is sent, however long the viewer takes."""
         self._sent += isinstance(item, FrameResult)
         super().put(item)
 
@@ -334,9 +334,9 @@ def _host_and_port(url: str) -> tuple[str, int]:
         parts = urlsplit(url)
         port = parts.port
     except ValueError as error:
-        raise ViewerError(f"'{url}' is no viewer's address: {error}.") from None
+        raise ViewerError(f"'{url}' is not a viewer's address: {error}.") from None
     if parts.scheme not in ("rerun", "rerun+http", "rerun+https") or not parts.hostname:
-        raise ViewerError(f"'{url}' is no viewer's address; write --connect rerun+http://HOST:PORT/proxy.")
+        raise ViewerError(f"'{url}' is not a viewer's address; write --connect rerun+http://HOST:PORT/proxy.")
     return parts.hostname, port or PORTS[0]
 
 
@@ -348,7 +348,7 @@ def _address_to_serve(address: str | None) -> tuple[str, int]:
         host, _, port = address.rpartition(":")
         if not host or ":" in host or not port.isdecimal() or not 0 < int(port) < 65536:
             raise ViewerError(
-                f"'{address}' is no address to serve on; write HOST:PORT, such as 127.0.0.1:9876"
+                f"'{address}' is not an address to serve on; write HOST:PORT, such as 127.0.0.1:9876"
                 " (the server takes no IPv6 address)."
             )
         addresses = [(host, int(port))]

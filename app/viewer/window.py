@@ -181,13 +181,13 @@ def get_window(options: ViewerOptions, taken: Container[int] = ()) -> Window:
             )
             return Window(local_url(port), found=False, awake=awake, notes=notes)
     raise ViewerError(
-        f"the viewer window does not start: the ports {PORTS[0]}..{PORTS[-1]} all have other"
-        " programs. End one, or use --save FILE.rrd --headless."
+        f"the viewer window does not start: the ports {PORTS[0]}..{PORTS[-1]} are all taken by"
+        " other programs. End one, or use --save FILE.rrd --headless."
     )
 
 
 def look_at(port: int) -> Listener | None:
-    """What is on a port of this machine; a viewer on another screen, or not ours, fits nobody."""
+    """What is on a port of this machine; a viewer on another screen, or of another version, does not fit."""
     if not listens(("127.0.0.1", port)):
         return None
     owner, program = owner_of(port), viewer_executable()
@@ -267,7 +267,7 @@ def _reason(process: subprocess.Popen[bytes], complaints: IO[bytes]) -> str:
     text = complaints.read().decode(errors="replace")
     errors = re.findall(r"^Error: (.+)$|panicked at .*\n(.+)$", text, re.MULTILINE)
     if errors:
-        # Without the places in its source code, which tell nobody anything here.
+        # Without the places in its source code, which say nothing to whoever reads this.
         words = re.sub(r"\bos error at \S+:\d+: ", "", "".join(errors[-1])).strip()
         return f"{words.rstrip('.')}."
     if process.returncode < 0:

@@ -466,7 +466,7 @@ def test_a_picture_of_nothing_is_refused(capsys: pytest.CaptureFixture[str], tmp
     picture = str(tmp_path / "a.png")
     assert "No such file" in refuse(capsys, "screenshot", str(tmp_path / "no.rrd"), picture)[1]
     (tmp_path / "a.rrd").write_text("no recording")
-    assert "no Rerun recording" in refuse(capsys, "screenshot", str(tmp_path / "a.rrd"), picture)[1]
+    assert "not a Rerun recording" in refuse(capsys, "screenshot", str(tmp_path / "a.rrd"), picture)[1]
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="children are read from /proc")

@@ -179,7 +179,7 @@ def test_a_write_that_fails_costs_no_more_than_itself(tmp_path: Path, monkeypatc
 
 @pytest.mark.parametrize("url", ["http://127.0.0.1:9876", "127.0.0.1:9876", "rerun+http:///proxy", "rubbish"])
 def test_address_that_is_none_is_refused(url: str) -> None:
-    with pytest.raises(ViewerError, match="no viewer's address"):
+    with pytest.raises(ViewerError, match="not a viewer's address"):
         Viewer(dataclasses.replace(HEADLESS, connect=url), live=True, times=StageTimes())
 
 
@@ -196,7 +196,7 @@ def test_absent_viewer_is_noticed_at_once() -> None:
 @pytest.mark.parametrize(
     ("address", "reason"),
     [
-        *((address, "no address") for address in ("9876", "localhost:", "localhost:99999", ":1")),
+        *((address, "not an address") for address in ("9876", "localhost:", "localhost:99999", ":1")),
         ("nowhere.invalid:9876", "cannot serve on nowhere.invalid:9876"),
         ("192.0.2.1:9876", "cannot serve on 192.0.2.1:9876: Cannot assign"),
     ],

@@ -154,10 +154,10 @@ def test_newer_or_foreign_table_is_left_alone(tmp_path: Path) -> None:
     said = metadata_of(path) or {}
     newer = {"key": said["key"], "summary": said["summary"]}
     write_table(path, pq.read_table(path).replace_schema_metadata(newer), SCHEMA + 1)
-    with pytest.raises(OutputError, match=f"has schema {SCHEMA + 1}.*knows {SCHEMA} and older. Update"):
+    with pytest.raises(OutputError, match=f"has schema {SCHEMA + 1}.*reads {SCHEMA} and older. Update"):
         do_recording(job_at(tmp_path), recording)
     path.write_bytes(b"mine")
-    with pytest.raises(OutputError, match="no table that batch wrote"):
+    with pytest.raises(OutputError, match="not a table that batch wrote"):
         do_recording(job_at(tmp_path), recording)
     assert path.read_bytes() == b"mine"
     do_recording(job_at(tmp_path, force=True), recording)
@@ -199,5 +199,5 @@ def test_names_of_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert found[3].source == str(tmp_path / "two/walk.oni")
     assert [each.name for each in recordings(["two?scale=500"], Path("two/out"))] == ["two/walk.oni", "two/inner/scan"]
     assert next(iter(recordings(["two?scale=500"]))).source.endswith("walk.oni?scale=500")
-    with pytest.raises(UsageError, match="nothing fits"):
+    with pytest.raises(UsageError, match="nothing matches"):
         list(recordings(["*.bag"]))
