@@ -68,14 +68,14 @@ def engine(scheduler: str | None = None, workers: int | None = None) -> Iterator
     # What is logged is read on importing it. The rest is set after that: what is set before takes all of Dask's own
     # settings with it when it is undone, from under threads that are still ending.
     with dask.config.set(_LOGGED):
-        from distributed import Client, LocalCluster
+        from distributed import Client
     with dask.config.set(_QUIET):
         if scheduler is not None:
             with _there(scheduler) as client:
                 yield client
             return
         with interrupt.started_deaf(), waiting("Starting the workers"):
-            cluster = LocalCluster(
+            client = Client(
                 n_workers=workers or default_threads(),
                 threads_per_worker=1,
                 processes=True,
@@ -83,7 +83,6 @@ def engine(scheduler: str | None = None, workers: int | None = None) -> Iterator
                 dashboard_address="127.0.0.1:0",
                 env={"SELECTIVE_DEPTH_THREADS": "1"},
             )
-            client = Client(cluster)
         done = False
         try:
             yield client
@@ -91,7 +90,6 @@ def engine(scheduler: str | None = None, workers: int | None = None) -> Iterator
         finally:
             if done:
                 client.close()
-                cluster.close()
             else:  # after Ctrl-C, say: what is under way is not waited for
                 for process in multiprocessing.active_children():
                     process.kill()

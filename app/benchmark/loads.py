@@ -32,11 +32,6 @@ class Spread:
     least: float
     most: float
 
-    @classmethod
-    def of(cls, values: list[float]) -> Spread:
-        """Of the figures of several runs."""
-        return cls(statistics.median(values), min(values), max(values))
-
 
 @dataclass(frozen=True)
 class Load:
@@ -96,7 +91,8 @@ def _run(source: str, name: str, frames: int | None, say: Callable[[str], None])
     reports = [run_once(source, settings, limit, saved=name != "replay") for _ in range(RUNS)]
 
     def spread(of: Callable[[RunReport], float]) -> Spread:
-        return Spread.of([of(report) for report in reports])
+        values = [of(report) for report in reports]
+        return Spread(statistics.median(values), min(values), max(values))
 
     return Load(
         fps=spread(lambda report: report.fps),

@@ -7,7 +7,7 @@ its cell's corners foretold, and the cells that were foretold worst are refined 
 from __future__ import annotations
 
 import heapq
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import numpy.typing as npt
@@ -80,9 +80,7 @@ def quadtree(measure: Measure, seeds: SeedGrid, shots: int) -> npt.NDArray[np.in
             left_over -= len(new)
         error = {pixel: abs(known[pixel] - expected[pixel]) if known.get(pixel, 0) > 0 else 0.0 for pixel in expected}
         if left_over > 0:
-            for a, b in ((u0, middle_u), (middle_u, u1)):
-                for c, d in ((v0, middle_v), (middle_v, v1)):
-                    if a < b and c < d:
-                        rim = ((a, c), (b, c), (a, d), (b, d))
-                        offer((a, c, b, d), max(error.get(pixel, 0.0) for pixel in rim))
+            for (a, b), (c, d) in product(pairwise((u0, middle_u, u1)), pairwise((v0, middle_v, v1))):
+                if a < b and c < d:
+                    offer((a, c, b, d), max(error.get(pixel, 0.0) for pixel in product((a, b), (c, d))))
     return np.array(order, np.int32)
