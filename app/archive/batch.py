@@ -38,10 +38,10 @@ SUMMARY_FILE = "summary.parquet"
 
 
 def recordings(words: Iterable[str], out: Path | None = None) -> Iterator[Recording]:
-    """All recordings that some words name, one by one: files, folders, patterns, ``-`` for a list on stdin.
+    """All recordings that the given words name, one by one: files, folders, patterns, ``-`` for a list on stdin.
 
     The name of a recording is its path from the folder that was given, that folder's name
-    included. Where two sources have one name, the second has eight letters more, always the same.
+    included. Where two sources have the same name, eight letters are added to the second's, always the same ones.
 
     Raises
     ------
@@ -127,7 +127,7 @@ class Batch:
         Raises
         ------
         OutputError, AppError
-            What ends all of it: a full disk, an option out of its range.
+            What ends the whole run: a full disk, an option out of its range.
         """
         out = self.job.out
         make_folder(out / WORK)
@@ -143,7 +143,7 @@ class Batch:
         stream = Stream(client, lambda told: self._heard.update([told]))
         threading.Thread(target=self._list, name="listing", daemon=True).start()
         while True:
-            complete = self.complete  # looked at first: afterwards no more come
+            complete = self.complete  # looked at first: once it is set, no more are added
             while self._waiting and not stream.full:
                 recording = self._waiting.popleft()
                 stream.submit(do_recording, self.job, recording, tag=partial(self._take, stream, recording))
@@ -166,7 +166,7 @@ class Batch:
         return summary
 
     def _list(self) -> None:
-        """Find the recordings, while the first of them are done already."""
+        """Find the recordings, while work on the first of them has begun already."""
         try:
             for each in recordings(self._words, self.job.out):
                 self._waiting.append(each)
@@ -176,7 +176,7 @@ class Batch:
         self.complete = True
 
     def _take(self, stream: Stream, recording: Recording, result: Any) -> None:
-        """A recording is done, or its ranges are joined, or it is to be cut."""
+        """Take in a result: a recording is done, or its ranges are joined, or it is to be cut into ranges."""
         if isinstance(result, Cut):
             ranges: list[Any] = [None] * len(result.starts)
             for at in range(len(ranges)):
@@ -199,7 +199,7 @@ class Batch:
     def _take_range(
         self, stream: Stream, recording: Recording, cut: Cut, ranges: list[Any], at: int, result: Any
     ) -> None:
-        """A range is done, perhaps the last of its recording."""
+        """Take in a range, perhaps the last of its recording."""
         ranges[at] = _row_of(recording, result)
         self._unfinished |= isinstance(result, Exception)
         self._heard[f"{recording.name} {cut.starts[at]}"] = ranges[at]["frames"]

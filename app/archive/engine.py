@@ -27,9 +27,9 @@ PATIENCE_S = 10.0
 """How long a scheduler may take to answer."""
 TOPIC = "selective-depth"
 _LOGGED = {"logging": dict.fromkeys(("distributed", "tornado", "asyncio", "bokeh"), "critical")}
-"""One line each is ours to say."""
+"""What Dask logs; what is worth a line is said by this program."""
 _QUIET = {
-    # Dask's own has malloc give back what every frame needs again.
+    # Dask's default makes malloc return memory to the system that the next frame needs again.
     "distributed.nanny.pre-spawn-environ": {f"{each}_NUM_THREADS": 1 for each in ("OMP", "MKL", "OPENBLAS")},
     "distributed.comm.timeouts.connect": f"{PATIENCE_S:g}s",
 }
@@ -50,7 +50,7 @@ def engine(scheduler: str | None = None, workers: int | None = None) -> Iterator
     ----------
     scheduler : str, optional
         Address of a scheduler, ``tcp://host:8786``, or the file that it writes; by default a
-        cluster of processes of this machine, with a kernel thread each, that ends with the client.
+        cluster of processes on this machine, with one kernel thread each, that ends with the client.
     workers : int, optional
         How many processes; default one per processor.
 
@@ -175,7 +175,7 @@ class Stream:
 
 
 def tell(what: Any) -> None:
-    """Tell the client how far a call on a worker has come; elsewhere, nothing."""
+    """Tell the client how far a call on a worker has come; does nothing elsewhere."""
     from distributed import get_worker
 
     with suppress(ValueError):

@@ -1,6 +1,6 @@
 """The table of a recording: a row for each frame, with what made it in its metadata.
 
-Everything that a later run has to know of a recording is in its table: whether it is done
+Everything that a later run has to know about a recording is in its table: whether it is done
 (``key``), what it came to (``summary``), what was wrong with it.
 """
 
@@ -106,7 +106,7 @@ class FigureTable:
             self._flush()
 
     def finish(self, key: str, about: dict[str, Any]) -> dict[str, Any]:
-        """Say what made it and what it came to; returns its row of the summary."""
+        """Record what made it and its means; returns its row of the summary."""
         self._flush()
         means = {name: mean.value for name, mean in self._means.items() if mean.count}
         summary = dict.fromkeys(SUMMARY) | about | {"frames": self.rows} | means
@@ -121,7 +121,7 @@ class FigureTable:
 
 @contextmanager
 def writing(path: Path, settings: dict[str, Any]) -> Iterator[FigureTable]:
-    """Write the table of a recording; without a row no file is left, nor an older one."""
+    """Write the table of a recording; if it has no row, no file is left, not even an older one."""
     make_folder(path.parent)
     schema = schema_of(COLUMNS).with_metadata({"settings": json.dumps(settings)})
     try:
@@ -138,7 +138,7 @@ class _NoRowError(Exception):
 
 
 def found_done(path: Path, key: str) -> dict[str, Any] | None:
-    """The row of the summary of a table that is there and was made with this key.
+    """The summary row of an existing table, if it was made with this key.
 
     Raises
     ------

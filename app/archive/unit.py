@@ -1,6 +1,6 @@
 """A unit of work: a recording, or a range of its frames, from its source to its table.
 
-Whatever worker does it, and however often, the same comes of it, but for the times.
+Whichever worker does it, and however often, the result is the same except for the times.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from selective_depth.drivers.options import parted
 from selective_depth.drivers.source import DepthSource
 
 RANGE_FRAMES = 300
-"""A recording is cut into ranges of so many frames or more, where it can be."""
+"""A recording that can be cut is cut into ranges of at least this many frames."""
 MOST_RANGES = 16
-"""Into so many at most: .oni files are read from their beginning for every range."""
+"""Into this many at most: .oni files are read from their beginning for every range."""
 TELL_S = 2.0
 WORK = ".batch"
-"""Folder in --out for what is not yet whole."""
+"""Folder in --out for what is not finished yet."""
 
 
 class Recording(NamedTuple):
@@ -50,7 +50,7 @@ class Keeper(Protocol):
 
     @property
     def whole(self) -> bool:
-        """Whether it needs all frames of a recording, in their order."""
+        """Whether it needs all frames of a recording in order."""
 
     def keeping(
         self, stem: Path, source: DepthSource, frames: int, settings: Settings
@@ -71,7 +71,7 @@ class Job:
     keeper : Keeper
         What is kept besides the tables.
     force : bool
-        Do again what is done.
+        Whether to repeat what is done already.
     version : str
         The client's.
     """
@@ -116,7 +116,7 @@ class Cut:
     stop : int
         The frame after the last.
     key, about
-        As for its table.
+        What its table will say of itself.
     """
 
     starts: tuple[int, ...]
@@ -175,7 +175,7 @@ def do_range(job: Job, recording: Recording, cut: Cut, at: int) -> dict[str, Any
 
 
 def join(job: Job, recording: Recording, cut: Cut, ranges: list[dict[str, Any]]) -> dict[str, Any]:
-    """Make one table of those of the ranges, up to the first damage; returns its row of the summary."""
+    """Join the tables of the ranges into one, up to the first damage; returns its row of the summary."""
     path = job.table(recording)
     about, key = cut.about, cut.key
     with writing(path, job.stated) as table:
@@ -199,7 +199,7 @@ _warm = False
 def _do_frames(
     job: Job, recording: Recording, source: DepthSource, span: range, table: FigureTable, *, last: bool = True
 ) -> dict[str, Any]:
-    """Every frame through the pipeline, to the table and what is kept; returns what there is to say."""
+    """Pass every frame through the pipeline to the table and to what is kept; returns state, failure and colour."""
     global _warm
     said_s = time.monotonic()
     colour = False
@@ -233,7 +233,7 @@ def _do_frames(
 
 
 def _key(job: Job, recording: Recording) -> tuple[str, int]:
-    """What tells whether a result is of these settings, this version and this recording; and its bytes."""
+    """A key that changes with the settings, the version and the recording; and the recording's size in bytes."""
     name, options = parted(recording.source)
     files = sorted(_files(Path(name)))
     told = (SCHEMA, __version__, job.stated, options, files)

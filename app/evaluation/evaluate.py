@@ -36,7 +36,7 @@ from selective_depth.selectors.quality import errors_of
 from selective_depth.selectors.reconstruct import reconstruct
 
 ENDLESS_FRAMES = 120
-"""So much is looked at of a source without end."""
+"""How many frames of a source without end are looked at."""
 
 FULL_NAMES = {
     "geo": "ratio_geometric_mean",
@@ -105,7 +105,7 @@ class Outcome:
 
 
 def run_strategy(name: str, case: Case) -> Errors:
-    """Let a strategy spend its budget on one frame and see what came of it."""
+    """Let a strategy spend its budget on one frame, and measure the errors of its model."""
     uv = strategy_of(name).pixels(case)
     depth_mm = case.frame.measure(uv)
     model_mm = reconstruct(uv, depth_mm, case.frame.shape)
@@ -147,7 +147,7 @@ def _end_with_parent() -> None:
 
 
 def frames_of(sources: Sequence[str], every: int, frames: int | None) -> Iterator[DepthFrame]:
-    """Every n-th frame of each source that shows anything, at most so many of each."""
+    """Every n-th frame of each source that has any depth, up to a number of frames from each."""
     for uri in sources:
         taken = 0
         with open_source(uri) as source:
@@ -161,7 +161,7 @@ def frames_of(sources: Sequence[str], every: int, frames: int | None) -> Iterato
 
 
 def check_named(sources: Sequence[str], options: ComparisonOptions) -> None:
-    """Refuse a comparison on no source, or of no budget."""
+    """Refuse a comparison without a source or without a budget."""
     if not sources:
         raise UsageError("no source was named; give recordings, folders or scenes.")
     if not options.budget:
@@ -223,7 +223,7 @@ def outcomes(
 
 
 def _most(sources: Sequence[str], options: ComparisonOptions) -> int:
-    """How many frames `frames_of` finds, if all of them show something."""
+    """How many frames `frames_of` finds, if all of them have depth."""
     total = 0
     for uri in sources:
         with open_and_tell(uri) as source:
@@ -234,7 +234,7 @@ def _most(sources: Sequence[str], options: ComparisonOptions) -> int:
 
 @contextmanager
 def _processes(jobs: int) -> Iterator[Executor]:
-    """So many processes of this machine, each with one kernel thread."""
+    """A pool of processes on this machine, each with one kernel thread."""
     # Spawned, not forked: the parent may hold threads and locks of other libraries.
     spawn = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())

@@ -65,7 +65,7 @@ def _truth(frame: DepthFrame) -> npt.NDArray[np.uint16]:
 
 
 def _often_returning(uri: str, frames: int | None) -> npt.NDArray[np.bool_] | None:
-    """Pixels that return depth in more than half of the frames of a still scene, else None."""
+    """Pixels that return depth in more than half of the frames, if the scene is still; else None."""
     first: npt.NDArray[np.uint16] | None = None
     returned, count = np.zeros(1, np.int64), 0
     for frame in _frames(uri, frames):
@@ -154,7 +154,7 @@ def _median(frames: deque[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
 def run_over_time(
     sources: Sequence[str], options: ComparisonOptions, settings: Settings, files: EvaluationFiles
 ) -> None:
-    """Follow each source, show what came of it, and write it as JSON if asked.
+    """Follow each source, print its errors, and write them as JSON if asked.
 
     Raises
     ------

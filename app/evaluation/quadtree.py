@@ -1,7 +1,7 @@
-"""Refinement by a quad-tree: where the surface between measured corners was most off, split.
+"""Refinement by a quad-tree: cells where the surface between the measured corners was most in error are split.
 
-In the manner of Shih et al. 2008 (reference 8 of the paper): what is measured is held against what
-its cell's corners foretold, and the cells that were foretold worst are refined first.
+In the manner of Shih et al. 2008 (reference 8 of the paper): what is measured is compared with what
+the corners of its cell predicted, and the cells that were predicted worst are refined first.
 """
 
 from __future__ import annotations

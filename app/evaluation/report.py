@@ -1,4 +1,4 @@
-"""What an evaluation came to: on the terminal, as JSON, as tables, and in pictures."""
+"""The results of an evaluation: on the terminal, as JSON, as tables, and in pictures."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def run_evaluation(
     Raises
     ------
     UsageError, OutputError
-        If there is no such strategy or a file cannot be written; found out before the work is done
+        If there is no such strategy or a file cannot be written; refused before the work is done
         where possible.
     """
     for picture in (files.picture, files.curves):
@@ -133,7 +133,7 @@ def to_markdown(found: Sequence[Outcome]) -> str:
 
 
 def to_json(found: Sequence[Outcome], options: ComparisonOptions, settings: Settings) -> str:
-    """The whole evaluation: figures by budget and strategy, in all and per source, and its making.
+    """The whole evaluation: figures by budget and strategy, in all and per source, and how it was made.
 
     Parameters
     ----------

@@ -69,7 +69,7 @@ class Case:
 
     @cached_property
     def open(self) -> npt.NDArray[np.bool_]:
-        """Pixels that may be shot in one go: no seed, and not so far from all that it is a hole."""
+        """Pixels that may be shot in one go: neither seeds nor too far from all of them to be anything but a hole."""
         return self.samples.open()
 
     @cached_property
@@ -238,7 +238,7 @@ def strategy_of(name: str) -> Strategy:
 
 
 def strategies_of(names: Sequence[str]) -> tuple[str, ...]:
-    """The strategies meant by names, by "main" (those without a "/"), "all" or FILE.py:NAME.
+    """The strategies that are given by name, as "main" (those without a "/"), "all" or as FILE.py:NAME.
 
     Raises
     ------

@@ -29,7 +29,7 @@ class Scale:
     colormap : str
         Name of the colour map, which no other quantity has.
     limits : tuple of float
-        Values at the dark and at the bright end; what lies beyond has the colour of the end.
+        Values at the dark and at the bright end; what lies beyond has the colour of that end.
     unit : str
         Of the limits; empty for a pure number.
     root : bool, default False
@@ -82,8 +82,8 @@ IMPROVEMENT = Scale("improvement", "inferno", (0.0, 1.0))
 ERROR = Scale("error", "ice", (0.0, 100.0), "mm", root=True, between=(5.0, 25.0))
 """Of models as of the kriging deviation, in the viewer, in stills and in evaluations alike.
 
-A good model is off by the sensor's noise, 1 to 5 mm, nearly everywhere and by hundreds at a few
-steps. On a linear scale it is black, and so is all that tells it from a better one; by the square
+A good model is off by the sensor's noise, 1 to 5 mm, nearly everywhere and by hundreds at a
+few discontinuities. On a linear scale it is black, and so is all that tells it from a better one; by the square
 root the noise has the lowest fifth of the colours, and what is off by more is told apart up to 100.
 """
 AGE = Scale("known, frames ago", "plasma", (25.0, 0.0))
@@ -232,7 +232,7 @@ def picture(scales: Sequence[Scale], swatches: Sequence[Swatch], columns: int = 
 
 
 def key(unit: str, lines: Sequence[Swatch]) -> Image:
-    """Draw the unit of a plot and what its lines are, to stand beside it, where that covers none of them."""
+    """Draw the unit of a plot and what its lines are, to be shown beside the plot, where it covers no line."""
     texts = [unit, *(text for text, _ in lines)]
     width = max(180, *(cv2.getTextSize((0, 0), text, (0, 0), _FACE, 24, 400)[2] for text in texts)) + 40
     image = np.full((34 * len(texts), width, 3), BACKGROUND, np.uint8)

@@ -1,4 +1,4 @@
-"""One panel of a picture for each thing that a frame went through: what is shown, and how."""
+"""One panel of a picture for each stage of a frame: what is shown, and how."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def backdrop(frame: DepthFrame) -> Image:
 
 
 def _scene_note(frame: DepthFrame) -> str:
-    """How much scene the frame is wide at its median depth."""
+    """How wide a part of the scene the frame shows at its median depth."""
     known = frame.depth_mm[frame.depth_mm > 0]
     if known.size == 0:
         return ""

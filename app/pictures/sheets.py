@@ -88,7 +88,7 @@ def sheet(rows: Sequence[Row], width_in: float = WIDTH_IN, *, legend: bool = Tru
                     left = _GAP + column * (each + _GAP)
                     box = (left / page_in, bottom / height, each / page_in, tall / height)
                     axes = figure.add_axes(box)
-                    _fill(axes, panel, zoom)
+                    _fill(axes, panel)
                     _caption(axes, panel, each, tall, zoom)
             top -= extra + tall
         if legend:
@@ -102,9 +102,9 @@ def alone(panel: Panel) -> Figure:
     from matplotlib.figure import Figure
 
     height, width = panel.image.shape[:2]
-    # A hundredth of a pixel more: what is a little less than a whole one would be cut off.
+    # A hundredth of a pixel more: a pixel that is a little less than whole would be cut off.
     figure = Figure(figsize=((width + 0.01) / DPI, (height + 0.01) / DPI))
-    _fill(figure.add_axes((0, 0, 1, 1)), panel, 1.0)
+    _fill(figure.add_axes((0, 0, 1, 1)), panel)
     return figure
 
 
@@ -143,7 +143,7 @@ def write_picture(path: Path, figure: Figure, dpi: int = DPI) -> None:
     write_output(path, drawn.getvalue())
 
 
-def _fill(axes: Axes, panel: Panel, zoom: float) -> None:
+def _fill(axes: Axes, panel: Panel) -> None:
     """Draw a panel's image and what lies over it, without a frame."""
     height, width = panel.image.shape[:2]
     axes.imshow(panel.image, aspect="auto", interpolation="antialiased")
@@ -190,5 +190,5 @@ def _explain(figure: Figure, shown: Container[str], page_in: float, height: floa
 
 
 def _told(text: str) -> str:
-    """A text that can be drawn: a file's name may hold bytes that are no UTF-8, or a line's end."""
+    """A text that can be drawn: a file's name may hold line breaks, or bytes that are not UTF-8."""
     return "".join(letter if letter.isprintable() else "�" for letter in text)

@@ -23,7 +23,7 @@ PICTURES = {
         "nodes settle on surfaces; triangles whose edges are short are the regions it selects",
     ),
     "score": ("3b Improvement", "improvement/score", "where one more measurement would help"),
-    "long": ("3a Edges", "gas/complement", "the triangles that are left out: steps between surfaces"),
+    "long": ("3a Edges", "gas/complement", "the triangles that are left out, at depth discontinuities"),
     "estimate": ("3b Estimate", "improvement/estimate improvement/unknown", "kriged depth between the seeds"),
     "deviation": ("3b Deviation", "errors/expected", "how far that is expected to be off"),
     "samples": ("4 By {by}", "samples holes", "what was measured besides, where this selector wanted it, by round"),

@@ -248,13 +248,10 @@ class ResultLogger:
 
         Errors are what the line tells: to the frame, or with a memory to the truth, if that is known.
         """
-        even = model.even
-        against = frame if to_truth and frame.truth_mm is not None else None
-        self._log("camera/model", self._depth_image(_as_depth(model.depth_mm)))
-        self._log("camera/errors/selective", _error_image(model, against))
-        if even is not None:
-            self._log("camera/even", self._depth_image(_as_depth(even.depth_mm)))
-            self._log("camera/errors/even", _error_image(even, against))
+        for name, error, each in (("model", "selective", model), ("even", "even", model.even)):
+            if each is not None:
+                self._log(f"camera/{name}", self._depth_image(_as_depth(each.depth_mm)))
+                self._log(f"camera/errors/{error}", _error_image(each, frame, to_truth))
         if frame.truth_mm is not None:
             self._log("camera/truth", self._depth_image(frame.truth_mm))
 
@@ -290,12 +287,13 @@ def _as_depth(value_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
     return np.where(value_mm > 0, value_mm, np.float32(0)).astype(np.uint16)
 
 
-def _error_image(model: Model, against: DepthFrame | None) -> rr.SegmentationImage:
-    """How far a model is off from its own frame, or from the truth of another."""
-    if against is None or against.truth_mm is None:
-        return _level_image(palette.ERROR, model.error_mm, ~np.isnan(model.error_mm))
-    seen = (against.depth_mm > 0) & (against.truth_mm > 0)
-    return _level_image(palette.ERROR, np.abs(model.depth_mm - against.truth_mm), seen)
+def _error_image(model: Model, frame: DepthFrame, to_truth: bool) -> rr.SegmentationImage:
+    """How far a model is off from its own frame, or from the truth of a frame, if that is known."""
+    error_mm = model.error_mm
+    if to_truth and frame.truth_mm is not None:
+        seen = (frame.depth_mm > 0) & (frame.truth_mm > 0)
+        error_mm = np.where(seen, np.abs(model.depth_mm - frame.truth_mm), np.float32(np.nan))
+    return _level_image(palette.ERROR, error_mm, ~np.isnan(error_mm))
 
 
 def _level_image(

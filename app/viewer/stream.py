@@ -21,7 +21,7 @@ from selective_depth.selectors.neural_gas import RegionSelection
 
 APPLICATION = "selective-depth"
 WRITE_S = 3.0
-"""A file that has not grown for so long while it should has failed."""
+"""A file that should have grown and has not for this long has failed."""
 SMALL_BYTES = 256 << 10
 """Less than an image of 640x480: an image makes a chunk, while small things are gathered."""
 
@@ -29,7 +29,7 @@ SMALL_BYTES = 256 << 10
 class Recording:
     """A recording stream with one sink; whoever made it is the only thread to use it.
 
-    Each sink has a stream of its own: what befalls one must not touch another.
+    Each sink has a stream of its own: what happens to one must not affect another.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class Recording:
         return cls(rr.FileSink(str(path), write_footer=index), application, options, batching)
 
     def flush(self, timeout_s: float = 1e9) -> bool:
-        """Wait until everything is sent or written; False if it is not, in time or for good."""
+        """Wait until everything is sent or written; False if that fails or takes too long."""
         try:
             self._stream.flush(timeout_sec=timeout_s)
         except RuntimeError:
@@ -88,7 +88,7 @@ class Recording:
         return True
 
     def is_written(self, path: Path, patience_s: float = WRITE_S) -> bool:
-        """Wait until everything is in its file; False if that does not grow while it should.
+        """Wait until everything is in its file; False if the file should grow and does not.
 
         The SDK's writer says nothing when a write fails, and never ends after it.
         """
@@ -100,7 +100,7 @@ class Recording:
         return True
 
     def finish(self) -> None:
-        """End it, with its index. Only after a `flush` that worked: else it waits for ever."""
+        """End it, with its index. Only after a successful `flush`; otherwise it waits for ever."""
         self._stream.disconnect()
 
     def abandon(self) -> None:

@@ -20,13 +20,13 @@ from selective_depth.drivers.errors import OutputError
 READY_S = 5.0
 """How long a sink may take to open before the run begins without it."""
 STALL_S = 0.5
-"""A viewer that takes longer over a result has stalled; a recording waits no more."""
+"""A viewer that takes longer over a result has stalled; a recording no longer waits for it."""
 CLOSE_ALL_S = 2.5
 """How long all sinks together may take over their last frames."""
 FILE_QUEUE = 8
 """Results of a sensor's frames that may wait for a file, while what was written is made sure of."""
 INDEXED_FRAMES = 1000
-"""Up to so many frames a file gets an index; beyond, its memory would be felt."""
+"""A file of up to this many frames gets an index; beyond, that would take too much memory."""
 
 
 class Viewer:
@@ -104,7 +104,7 @@ class Viewer:
             self._news.append(why)
 
     def _open_window(self, showing: Showing) -> str:
-        """Open it; returns why the run cannot rely on it, in a sentence, or nothing."""
+        """Open the window; returns a sentence on why the run cannot rely on it, or nothing."""
         try:
             served = [sink.port for sink in self._sinks if isinstance(sink, ServedSink)]
             window = WindowSink(showing, served)
@@ -124,7 +124,7 @@ class Viewer:
         self.options = dataclasses.replace(self.options, save=path)
 
     def _see_served(self) -> None:
-        """Wait until a stream that is to be served is served."""
+        """Wait until the stream, if one is to be served, is served."""
         for way in self._ways:
             if isinstance(way.sink, ServedSink):
                 way.ready.wait(READY_S)

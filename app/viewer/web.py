@@ -21,7 +21,7 @@ BIRTH_S = 10.0
 
 
 def free_port(host: str, ports: Iterable[int]) -> int:
-    """The first of some ports that nobody has.
+    """The first of some ports that is free.
 
     Raises
     ------
@@ -86,8 +86,8 @@ def serving_web_viewer(host: str, stream: int) -> Iterator[int]:
 def web_address(host: str, viewer: int, stream: int) -> str:
     """What a browser opens to see a stream, both of which it reaches at a host.
 
-    On this machine the viewer has the other one of its names: to a browser that is another site, which gets
-    a process of its own, so that a page around it is not held up while it paints.
+    On this machine the viewer is given the other of the host's two names: a browser takes that for another
+    site and gives it a process of its own, so that the page around it is not held up while it paints.
     """
     page = {"127.0.0.1": "localhost", "localhost": "127.0.0.1"}.get(host, host)
     joined = quote(f"rerun+http://{host}:{stream}/proxy", safe="")

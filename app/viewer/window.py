@@ -37,7 +37,7 @@ ASK_OURS_S = 0.5
 BIRTH_S = 5.0
 """How long a window may take to open before the run goes on."""
 TRIES = 3
-"""How often a port that another program has taken in the meantime is changed."""
+"""How often another port is tried when another program has taken the chosen one in the meantime."""
 _LEAST_GAP_S = 0.05
 
 
@@ -48,7 +48,7 @@ class Listener:
     Attributes
     ----------
     name : str
-        What sentences call it.
+        What messages call it.
     viewer : bool
         Whether it is a viewer, of whatever version.
     fits : bool
@@ -79,7 +79,7 @@ class Window:
     awake : bool
         Whether it has answered; one that has not may still be opening, or never.
     notes : tuple of str
-        What is worth telling of how it was got, a sentence each.
+        What the user should know about how it was found or opened, a sentence each.
     """
 
     url: str
@@ -203,7 +203,7 @@ def look_at(port: int) -> Listener | None:
 def start(
     port: int, options: ViewerOptions, *more: str, patience_s: float = BIRTH_S
 ) -> tuple[subprocess.Popen[bytes], bool | None]:
-    """Start a viewer, with `more` arguments, and watch its birth.
+    """Start a viewer, with `more` arguments, and wait until it answers.
 
     False if it lives but has not answered in time, None if another program had the port first.
 
@@ -288,7 +288,7 @@ def viewer_executable() -> str | None:
 
 
 def join_command(url: str) -> str:
-    """What to type to see a served stream; with its folder where `rerun` alone is not this one."""
+    """What to type to see a served stream; with the folder, where `rerun` alone starts another viewer."""
     ours, on_path = Path(sys.executable).with_name("rerun"), shutil.which("rerun")
     plain = not ours.is_file() or (on_path is not None and ours.samefile(on_path))
     return f"{'rerun' if plain else ours} --connect {url}"
