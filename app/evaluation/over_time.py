@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.app.console.columns import print_table
-from selective_depth.app.console.output import write_output
-from selective_depth.app.console.progress import FrameProgress
-from selective_depth.app.evaluation.evaluate import ENDLESS_FRAMES, check_named
-from selective_depth.app.pictures import sheet, write_picture
-from selective_depth.app.pictures.panels import depth_panel, error_panel
-from selective_depth.app.pipeline import say
-from selective_depth.app.settings import ComparisonOptions, EvaluationFiles, Settings
+from selective_depth.app.evaluation.evaluate import ENDLESS_FRAMES
+from selective_depth.app.settings import ComparisonOptions, Settings
 from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
@@ -29,9 +22,6 @@ from selective_depth.selectors.memory import TemporalAcquisition, TemporalStep
 from selective_depth.selectors.memory.store import KEPT
 from selective_depth.selectors.quality import errors_of
 from selective_depth.selectors.seeds import SeedGrid
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 FIRST_BUDGET = 0.05
 """Beyond the seeds: of a first frame with memory, and of every frame without."""
@@ -60,7 +50,8 @@ def _frames(uri: str, limit: int | None) -> Iterator[DepthFrame]:
         yield from islice(source, limit or most)
 
 
-def _truth(frame: DepthFrame) -> npt.NDArray[np.uint16]:
+def truth_of(frame: DepthFrame) -> npt.NDArray[np.uint16]:
+    """Exact depth where it is known, else the frame's own."""
     return frame.depth_mm if frame.truth_mm is None else frame.truth_mm
 
 
@@ -131,7 +122,7 @@ def over_time(
         seeds = SeedGrid.from_frame(frame, seeds_shape)
         loop = acquire(frame.measure, seeds, FIRST_BUDGET, options.rounds)
         last.append(np.where(frame.depth_mm > 0, frame.depth_mm, np.float32(np.nan)))
-        truth = _truth(frame)
+        truth = truth_of(frame)
         scored = (truth > 0) & ((frame.depth_mm > 0) if often is None else often)
         models: list[npt.NDArray[Any]] = [step.model_mm, loop.reconstruct(), frame.depth_mm, _median(last)]
         for way, model_mm in zip(WAYS, models, strict=True):
@@ -149,60 +140,3 @@ def _median(frames: deque[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
     upper = np.take_along_axis(stack, np.maximum(count // 2, 0)[None], axis=0)[0]
     middle: npt.NDArray[np.float32] = np.where(count > 0, (lower + upper) / 2, 0)
     return middle
-
-
-def run_over_time(
-    sources: Sequence[str], options: ComparisonOptions, settings: Settings, files: EvaluationFiles
-) -> None:
-    """Follow each source, print its errors, and write them as JSON if asked.
-
-    Raises
-    ------
-    UsageError
-        If there is no source or no budget.
-    OutputError
-        If a file cannot be written.
-    """
-    check_named(sources, options)
-    budget = float(options.budget[0])
-    found: dict[str, dict[str, Course]] = {}
-    for uri in sources:
-        with FrameProgress(f"Following {uri}", options.frames) as bar:
-            for followed in over_time(uri, options, settings):
-                bar.update(followed[1].frame + 1)
-        frame, step, found[uri] = followed
-        _print(uri, found[uri], budget)
-        if files.picture is not None and len(found) == 1:
-            write_picture(files.picture, _picture(frame, step))
-            say(f"wrote {files.picture}")
-    if files.json is not None:
-        document = {
-            "over_time": {uri: {way: asdict(course) for way, course in ways.items()} for uri, ways in found.items()},
-            "budget": budget,
-        }
-        write_output(files.json, json.dumps(document, indent=1) + "\n")
-        say(f"wrote {files.json}")
-
-
-def _picture(frame: DepthFrame, step: TemporalStep) -> Figure:
-    """The truth, the sensor's whole frame and the memory's model, and how wrong both are."""
-    exact = replace(frame, depth_mm=_truth(frame))
-    remembered = replace(frame, depth_mm=np.clip(np.rint(step.model_mm), 0, 65535).astype(np.uint16))
-    first = [depth_panel(exact, "Truth"), depth_panel(frame, "One whole frame"), depth_panel(remembered, "Memory")]
-    seen = replace(exact, depth_mm=np.where(frame.depth_mm > 0, exact.depth_mm, 0).astype(np.uint16))
-    errors = [error_panel(seen, shown.depth_mm.astype(np.float32), "Its error") for shown in (frame, remembered)]
-    share = f"{100 * len(step.uv) / frame.depth_mm.size:.3g} % of the pixels a frame"
-    return sheet([(f"Frame {step.frame}: memory from {share}", first), ("", [None, *errors])], legend=False)
-
-
-def _print(uri: str, ways: dict[str, Course], budget: float) -> None:
-    count = len(ways["memory"].rmse_mm)
-    at = sorted({0, count // 2, count - 1})
-    rows = []
-    for way, course in ways.items():
-        figures = [(course.rmse_mm[i], course.mae_mm[i]) for i in at]
-        figures.append((float(np.nanmean(course.rmse_mm)), float(np.nanmean(course.mae_mm))))
-        rows.append((way.replace("_", " "), *(f"{rmse:.1f} / {mae:.1f}" for rmse, mae in figures)))
-    heads = ("RMSE / MAE, mm", *(f"frame {index}" for index in at), "mean")
-    title = f"{uri}: {count} frames, {100 * budget:g} % of the pixels a frame with memory"
-    print_table(rows, heads, bold="memory", title=title)

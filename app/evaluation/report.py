@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,15 +16,17 @@ from selective_depth.app.console import tables
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.output import check_output, check_picture, write_output
 from selective_depth.app.console.progress import FrameProgress
-from selective_depth.app.evaluation.evaluate import Outcome, Results, frames_of, outcomes, summarise
-from selective_depth.app.evaluation.over_time import run_over_time
+from selective_depth.app.evaluation.evaluate import Outcome, Results, check_named, frames_of, outcomes, summarise
+from selective_depth.app.evaluation.over_time import Course, over_time, truth_of
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategy_of
 from selective_depth.app.pictures import Panel, sheet, write_picture
-from selective_depth.app.pictures.panels import error_panel, shots_panel
+from selective_depth.app.pictures.panels import depth_panel, error_panel, shots_panel
 from selective_depth.app.pictures.sheets import WIDTH_IN
 from selective_depth.app.pipeline import say
 from selective_depth.app.settings import ComparisonOptions, EvaluationFiles, PictureOptions, Settings
+from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import acquire, shots_of
+from selective_depth.selectors.memory import TemporalStep
 from selective_depth.selectors.reconstruct import reconstruct
 
 if TYPE_CHECKING:
@@ -76,7 +78,7 @@ def run_evaluation(
     check_output(files.json, files.page)
     check_picture(files.table, TABLES, "table")
     if options.over_time:
-        return run_over_time(sources, options, settings, files)
+        return _run_over_time(sources, options, settings, files)
     with FrameProgress("Evaluating", None) as bar:
         found = outcomes(sources, options, settings, lambda done, total: bar.update(done, f"of {total}"))
     print_results(summarise(found), len({outcome.frame for outcome in found}), options.rounds)
@@ -239,3 +241,60 @@ def comparison(case: Case, width_in: float = WIDTH_IN) -> Figure:
     total = (len(case.seed_uv) + case.shots) / case.frame.depth_mm.size
     title = f"The same {total:.1%} of the pixels: where they are measured, and the model's error"
     return sheet([(title, shots), ("", errors)], width_in, legend=False)
+
+
+def _run_over_time(
+    sources: Sequence[str], options: ComparisonOptions, settings: Settings, files: EvaluationFiles
+) -> None:
+    """Follow each source, print its errors, and write them as JSON if asked.
+
+    Raises
+    ------
+    UsageError
+        If there is no source or no budget.
+    OutputError
+        If a file cannot be written.
+    """
+    check_named(sources, options)
+    budget = float(options.budget[0])
+    found: dict[str, dict[str, Course]] = {}
+    for uri in sources:
+        with FrameProgress(f"Following {uri}", options.frames) as bar:
+            for followed in over_time(uri, options, settings):
+                bar.update(followed[1].frame + 1)
+        frame, step, found[uri] = followed
+        _print_courses(uri, found[uri], budget)
+        if files.picture is not None and len(found) == 1:
+            write_picture(files.picture, _memory_picture(frame, step))
+            say(f"wrote {files.picture}")
+    if files.json is not None:
+        document = {
+            "over_time": {uri: {way: asdict(course) for way, course in ways.items()} for uri, ways in found.items()},
+            "budget": budget,
+        }
+        write_output(files.json, json.dumps(document, indent=1) + "\n")
+        say(f"wrote {files.json}")
+
+
+def _memory_picture(frame: DepthFrame, step: TemporalStep) -> Figure:
+    """The truth, the sensor's whole frame and the memory's model, and how wrong both are."""
+    exact = replace(frame, depth_mm=truth_of(frame))
+    remembered = replace(frame, depth_mm=np.clip(np.rint(step.model_mm), 0, 65535).astype(np.uint16))
+    first = [depth_panel(exact, "Truth"), depth_panel(frame, "One whole frame"), depth_panel(remembered, "Memory")]
+    seen = replace(exact, depth_mm=np.where(frame.depth_mm > 0, exact.depth_mm, 0).astype(np.uint16))
+    errors = [error_panel(seen, shown.depth_mm.astype(np.float32), "Its error") for shown in (frame, remembered)]
+    share = f"{100 * len(step.uv) / frame.depth_mm.size:.3g} % of the pixels a frame"
+    return sheet([(f"Frame {step.frame}: memory from {share}", first), ("", [None, *errors])], legend=False)
+
+
+def _print_courses(uri: str, ways: dict[str, Course], budget: float) -> None:
+    count = len(ways["memory"].rmse_mm)
+    at = sorted({0, count // 2, count - 1})
+    rows = []
+    for way, course in ways.items():
+        figures = [(course.rmse_mm[i], course.mae_mm[i]) for i in at]
+        figures.append((float(np.nanmean(course.rmse_mm)), float(np.nanmean(course.mae_mm))))
+        rows.append((way.replace("_", " "), *(f"{rmse:.1f} / {mae:.1f}" for rmse, mae in figures)))
+    heads = ("RMSE / MAE, mm", *(f"frame {index}" for index in at), "mean")
+    title = f"{uri}: {count} frames, {100 * budget:g} % of the pixels a frame with memory"
+    print_table(rows, heads, bold="memory", title=title)
