@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 
 from selective_depth.app.viewer.sinks import Item, Sink
@@ -11,16 +12,13 @@ from selective_depth.app.viewer.sinks import Item, Sink
 class Handover:
     """A worker thread that feeds a sink from a short queue; it alone calls it.
 
-    A lossless hand-over waits for room, so that every item arrives. Any other waits at most
-    `patience_s` for a sink that is merely slow and not at all for one that has stalled: then
-    the oldest item goes, counted in `dropped`.
+    It waits for room, at most `patience_s`, for a sink that is merely slow, and not at all for one that
+    has stalled: then the oldest item goes, counted in `dropped`. With infinite patience every item arrives.
 
     Parameters
     ----------
     sink : Sink
         Where items go.
-    lossless : bool
-        Whether every item must arrive.
     patience_s : float, default 0
         Longest wait for room, in seconds, before an item is dropped.
     capacity : int, default 2
@@ -36,12 +34,11 @@ class Handover:
         What ended the sink before its time; nothing is taken any more.
     """
 
-    def __init__(self, sink: Sink, *, lossless: bool, patience_s: float = 0.0, capacity: int = 2) -> None:
+    def __init__(self, sink: Sink, *, patience_s: float = 0.0, capacity: int = 2) -> None:
         self.sink = sink
         self.dropped = 0
         self.failure: Exception | None = None
         self.ready = threading.Event()
-        self._lossless = lossless
         self._patience_s = patience_s
         self._capacity = capacity
         self._queue: deque[Item] = deque()
@@ -55,16 +52,14 @@ class Handover:
     def offer(self, item: Item) -> None:
         """Hand over an item."""
         with self._changed:
-            if self._lossless:
-                # Waits in short turns: Ctrl-C must get through on every platform.
-                while self._full():
-                    self._changed.wait(0.2)
-            elif self._full() and not self._stalled:
-                self._stalled = not self._changed.wait_for(lambda: not self._full(), self._patience_s)
+            deadline_s = time.monotonic() + (0.0 if self._stalled else self._patience_s)
+            while self._full() and (left_s := deadline_s - time.monotonic()) > 0:
+                self._changed.wait(min(left_s, 0.2))  # in short turns: Ctrl-C must get through on every platform
             if self.failure is not None:
                 self.dropped += 1
                 return
-            if self._full():
+            self._stalled = self._full()
+            if self._stalled:
                 self._queue.popleft()
                 self.dropped += 1
             self._queue.append(item)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 import time
 from collections import deque
@@ -199,12 +200,9 @@ class Viewer:
 
 def _handover(sink: Sink, live: bool) -> Handover:
     file = isinstance(sink, FileSink)
-    return Handover(
-        sink,
-        lossless=file and not live,
-        patience_s=0.0 if live else STALL_S,
-        capacity=FILE_QUEUE if file and live else 2,
-    )
+    if live:
+        return Handover(sink, capacity=FILE_QUEUE if file else 2)
+    return Handover(sink, patience_s=math.inf if file else STALL_S)
 
 
 def _application(title: str, options: ViewerOptions) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 
@@ -35,10 +36,10 @@ class Gate:
         self.closed = True
 
 
-def test_lossless_delivers_everything_in_order() -> None:
+def test_infinite_patience_delivers_everything_in_order() -> None:
     gate = Gate()
     gate.opened.set()
-    handover = Handover(gate, lossless=True)
+    handover = Handover(gate, patience_s=math.inf)
     for item in range(500):
         handover.offer(item)
     assert handover.finish(5)
@@ -49,7 +50,7 @@ def test_lossless_delivers_everything_in_order() -> None:
 
 def test_stalled_sink_costs_items_but_no_time() -> None:
     gate = Gate()
-    handover = Handover(gate, lossless=False, capacity=2)
+    handover = Handover(gate, capacity=2)
     handover.offer(0)
     gate.busy.wait()
     start_s = time.monotonic()
@@ -64,7 +65,7 @@ def test_stalled_sink_costs_items_but_no_time() -> None:
 
 def test_patience_is_spent_once() -> None:
     gate = Gate()
-    handover = Handover(gate, lossless=False, patience_s=0.2, capacity=1)
+    handover = Handover(gate, patience_s=0.2, capacity=1)
     handover.offer(0)
     gate.busy.wait()
     start_s = time.monotonic()
@@ -77,7 +78,7 @@ def test_patience_is_spent_once() -> None:
 
 def test_slow_sink_is_waited_for() -> None:
     gate = Gate()
-    handover = Handover(gate, lossless=False, patience_s=5, capacity=1)
+    handover = Handover(gate, patience_s=5, capacity=1)
     threading.Timer(0.1, gate.opened.set).start()
     for item in range(50):
         handover.offer(item)
@@ -85,11 +86,11 @@ def test_slow_sink_is_waited_for() -> None:
     assert gate.taken == list(range(50))
 
 
-@pytest.mark.parametrize("lossless", [False, True])
-def test_failure_is_told_and_blocks_nobody(lossless: bool) -> None:
+@pytest.mark.parametrize("patience_s", [0, math.inf])
+def test_failure_is_told_and_blocks_nobody(patience_s: float) -> None:
     gate = Gate()
     gate.opened.set()
-    handover = Handover(gate, lossless=lossless, capacity=1)
+    handover = Handover(gate, patience_s=patience_s, capacity=1)
     handover.offer(-1)
     gate.busy.wait()
     for item in range(100):
@@ -101,7 +102,7 @@ def test_failure_is_told_and_blocks_nobody(lossless: bool) -> None:
 
 def test_finish_leaves_a_stalled_sink_behind() -> None:
     gate = Gate()
-    handover = Handover(gate, lossless=False)
+    handover = Handover(gate)
     for item in range(3):
         handover.offer(item)
     start_s = time.monotonic()
@@ -112,7 +113,7 @@ def test_finish_leaves_a_stalled_sink_behind() -> None:
 
 def test_what_a_failed_sink_had_in_hand_and_before_it_is_dropped() -> None:
     gate = Gate()
-    handover = Handover(gate, lossless=False)
+    handover = Handover(gate)
     for item in (-1, 1, 2):
         handover.offer(item)
         gate.busy.wait()
@@ -126,7 +127,7 @@ def test_what_a_failed_sink_had_in_hand_and_before_it_is_dropped() -> None:
 def test_what_a_sink_took_before_it_failed_is_not_dropped() -> None:
     gate = Gate()
     gate.opened.set()
-    handover = Handover(gate, lossless=True)
+    handover = Handover(gate, patience_s=math.inf)
     for item in (1, 2, -1):
         handover.offer(item)
     assert handover.finish(5)
@@ -135,7 +136,7 @@ def test_what_a_sink_took_before_it_failed_is_not_dropped() -> None:
 
 def test_what_a_sink_left_behind_had_in_hand_and_before_it_is_dropped() -> None:
     gate = Gate()
-    handover = Handover(gate, lossless=False)
+    handover = Handover(gate)
     for item in range(3):
         handover.offer(item)
         gate.busy.wait()
@@ -150,14 +151,14 @@ def test_a_sink_that_does_not_open_is_waited_for_no_longer(monkeypatch: pytest.M
 
     gate = Gate()
     monkeypatch.setattr(gate, "open", refuse)
-    handover = Handover(gate, lossless=False)
+    handover = Handover(gate)
     assert handover.ready.wait(2)
     assert isinstance(handover.failure, OSError)
 
 
 def test_patience_is_back_after_a_stall() -> None:
     gate = Gate()
-    handover = Handover(gate, lossless=False, patience_s=0.05, capacity=1)
+    handover = Handover(gate, patience_s=0.05, capacity=1)
     handover.offer(0)
     gate.busy.wait()
     handover.offer(1)
