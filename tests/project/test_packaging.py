@@ -29,3 +29,12 @@ def test_every_room_is_packaged() -> None:
         if folder.is_dir() and any(folder.glob("*.py"))
     }
     assert set(settings["packages"]) == rooms | {"selective_depth.recordings"}
+
+
+def test_texts_that_a_room_reads_are_packaged() -> None:
+    packaged = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    texts = [path for path in (ROOT / "app").rglob("*.md") if any(path.parent.glob("*.py"))]
+    assert texts
+    for path in texts:
+        room = "selective_depth." + ".".join(path.parent.relative_to(ROOT).parts)
+        assert path.name in packaged[room]
