@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from selective_depth.app.console.output import make_folder
 from selective_depth.app.console.tables import metadata_of, parquet_writer
-from selective_depth.app.pipeline import FrameResult, figures_of
+from selective_depth.app.pipeline import STAGES, FrameResult, figures_of
 from selective_depth.app.pipeline.report import Mean
 from selective_depth.drivers.errors import OutputError
 
@@ -44,10 +44,7 @@ COLUMNS = {
     "truth_rmse_mm": (_FLOAT, "as rmse_mm, against the exact depth of a made scene"),
     "sensor_rmse_mm": (_FLOAT, "of the full frame against the exact depth"),
     "even_rmse_mm": (_FLOAT, "as rmse_mm, of an even lattice of as many measurements, every 10th frame"),
-    **{
-        f"{stage}_ms": (_FLOAT, f"time of the stage {stage}")
-        for stage in ("read", "seeds", "neural_gas", "improvement", "acquire", "model", "loop")
-    },
+    **{f"{stage}_ms": (_FLOAT, f"time of the stage {stage}") for stage in STAGES if stage != "log"},
 }
 """Name of each column: its type and what it says; what was not made of a frame is null."""
 MEANS = [name for name in COLUMNS if name not in ("frame", "timestamp_us")]

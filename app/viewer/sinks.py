@@ -281,7 +281,13 @@ class RemoteSink(Sink):
 
 
 class WindowSink(RemoteSink):
-    """Opens a viewer window, or uses the one that is open, which outlives this program."""
+    """Opens a viewer window, or uses the one that is open, which outlives this program.
+
+    Attributes
+    ----------
+    window : Window
+        The one that is used.
+    """
 
     def __init__(self, showing: Showing, taken: Container[int]) -> None:
         self._taken = taken
@@ -289,7 +295,7 @@ class WindowSink(RemoteSink):
 
     def open(self) -> None:
         """Open the recording; in another window if the one that was found is just closing."""
-        if self._window.found:
+        if self.window.found:
             time.sleep(SETTLE_S)
             if not self._is_back():
                 self._meet()
@@ -300,17 +306,12 @@ class WindowSink(RemoteSink):
         self._sent += isinstance(item, FrameResult)
         super().put(item)
 
-    @property
-    def awake(self) -> bool:
-        """Whether the window has answered; one that has not may still be opening, or never."""
-        return self._window.awake
-
     def _meet(self) -> None:
-        self._window = get_window(self.showing.options, self._taken)
+        self.window = get_window(self.showing.options, self._taken)
         self._since_s, self._sent = time.monotonic(), 0
-        self.url = self._window.url
+        self.url = self.window.url
         self._address = _host_and_port(self.url)
-        for note in self._window.notes:
+        for note in self.window.notes:
             self.showing.tell(note)
 
     def _is_back(self) -> bool:
@@ -318,7 +319,7 @@ class WindowSink(RemoteSink):
         return listener is not None and listener.fits
 
     def _lose(self, item: Item) -> None:
-        if not self._window.found or time.monotonic() - self._since_s > CLOSING_S:
+        if not self.window.found or time.monotonic() - self._since_s > CLOSING_S:
             super()._lose(item)
             return
         self.showing.tell("The viewer window that was open was just closing; another is opened.")

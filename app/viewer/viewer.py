@@ -107,12 +107,12 @@ class Viewer:
     def _open_window(self, showing: Showing) -> str:
         """Open the window; returns a sentence on why the run cannot rely on it, or nothing."""
         try:
-            served = [sink.port for sink in self._sinks if isinstance(sink, ServedSink)]
-            window = WindowSink(showing, served)
+            served = [other.port for other in self._sinks if isinstance(other, ServedSink)]
+            sink = WindowSink(showing, served)
         except ViewerError as error:
             return f"{str(error)[0].upper()}{str(error)[1:]}"
-        self._sinks.append(window)
-        return "" if window.awake else f"The viewer window has not opened within {BIRTH_S:g} s."
+        self._sinks.append(sink)
+        return "" if sink.window.awake else f"The viewer window has not opened within {BIRTH_S:g} s."
 
     def _save_instead(self, path: Path, showing: Showing) -> None:
         try:
