@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
 from selective_depth.drivers.virtual.renderer import Shapes
-from selective_depth.drivers.virtual.scenes import Builder, Material
+from selective_depth.drivers.virtual.scenes import Builder, Material, turn_of
 
 OUTSIDE_MM = 1300.0
 """So far to the side, what is 2 m away is not seen by a Kinect."""
@@ -50,8 +48,8 @@ def chair(b: Builder, time_s: float) -> None:
     """A chair 1.5 m away that somebody turns after two seconds, within a fifth of one."""
     yaw = 15 + 70 * min(max(time_s - TURNED_S, 0.0) / 0.2, 1.0)
     b.box(Material.CLOTH, (-250.0, 330.0, 1500.0), (420, 70, 420), yaw)
-    back = np.array((-250.0, 100.0, 1500.0)) + 180 * np.array((np.sin(np.radians(yaw)), 0.0, np.cos(np.radians(yaw))))
-    b.box(Material.CLOTH, (float(back[0]), 100.0, float(back[2])), (420, 400, 60), yaw)
+    back = turn_of(yaw, 0) @ (0, 0, 180) + (-250.0, 100.0, 1500.0)
+    b.box(Material.CLOTH, back, (420, 400, 60), yaw)
     b.rod(Material.METAL, (-250.0, 365.0, 1500.0), (-250.0, 700.0, 1500.0), 30)
 
 

@@ -11,21 +11,7 @@ from selective_depth.drivers.frame import Camera, ColourArray
 from selective_depth.drivers.kernels import njit
 from selective_depth.drivers.virtual.scenes import Material
 
-_TINTS = {
-    Material.NONE: (12, 13, 16),
-    Material.WALL: (214, 206, 190),
-    Material.FLOOR: (122, 112, 104),
-    Material.WOOD: (176, 128, 82),
-    Material.PLASTIC: (92, 96, 104),
-    Material.BLACK: (38, 38, 42),
-    Material.SCREEN: (34, 84, 132),
-    Material.METAL: (158, 164, 170),
-    Material.PAINT: (186, 52, 44),
-    Material.RUBBER: (52, 118, 190),
-    Material.CLOTH: (66, 128, 92),
-}
-"""Red, green and blue of each material in full light; chosen, not measured."""
-_TINT = np.array([_TINTS[stuff] for stuff in Material], np.float64)
+_TINT = np.array([stuff.tint for stuff in Material], np.float64)
 _WALL, _FLOOR, _WOOD, _SCREEN = (int(each) for each in (Material.WALL, Material.FLOOR, Material.WOOD, Material.SCREEN))
 _PATTERNED = np.array([stuff in (_WALL, _FLOOR, _WOOD, _SCREEN, Material.CLOTH) for stuff in Material])
 _LAMP = np.array((-0.45, -0.75, -0.49))

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import struct
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -76,7 +78,7 @@ def read_ply(path: Path) -> Mesh:
     Raises
     ------
     SourceNotFoundError
-        If there is no such file, or it is no PLY file.
+        If there is no such file, or it is not a PLY file.
     DamagedRecordingError
         If it is one and cannot be read: a bad header, a truncated body, a face that names no
         vertex, coordinates that are not finite.
@@ -87,6 +89,8 @@ def read_ply(path: Path) -> Mesh:
         data = path.read_bytes()
     except OSError as error:
         raise SourceNotFoundError(f"'{path}' cannot be read: {error.strerror}") from error
+    if not data.startswith((b"ply\n", b"ply\r\n", b"ply\r")):
+        raise SourceNotFoundError(f"'{path}' is not a PLY file: it does not begin with the line 'ply'")
     try:
         order, elements, start = _header(data)
         if not order:
@@ -95,14 +99,8 @@ def read_ply(path: Path) -> Mesh:
         for element in elements:
             start = _read_element(data, start, order, element, columns)
         return _mesh(columns)
-    except _NoPlyError:
-        raise SourceNotFoundError(f"'{path}' is no PLY file: it does not begin with the line 'ply'") from None
     except _BadPlyError as error:
         raise DamagedRecordingError(f"'{path}' cannot be read: {error}. Export the object again as PLY.") from error
-
-
-class _NoPlyError(Exception):
-    """The file is something else."""
 
 
 class _BadPlyError(Exception):
@@ -125,8 +123,6 @@ _Columns = dict[tuple[str, str], _Column]
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
     """Byte order ('' = ascii), elements, and where the body begins."""
-    if not data.startswith((b"ply\n", b"ply\r\n", b"ply\r")):
-        raise _NoPlyError
     end = data.find(b"end_header", 0, _HEADER_LIMIT)
     if end < 0:
         raise _BadPlyError("its header has no end")
@@ -182,36 +178,41 @@ def _read_element(data: bytes, at: int, order: str, element: _Element, columns: 
         return at
     # Held against the bytes that are left before anything is sized by it.
     _check_room(data, at, element.rows * sum(each.least for each in element.properties), element)
-    places, end = _walk(data, at, order, element, 1)
-    width = end - at  # the usual case first: all rows are laid out as the first
-    steps = width * np.arange(element.rows)
-    uniform = width * element.rows <= len(data) - at and all(
-        (_gather(data, begins - each.least + steps, None, order + each.count) == lengths[0]).all()
-        for each, (begins, lengths) in zip(element.properties, places, strict=True)
-        if each.count
-    )
-    if uniform:
-        places = [(begins + steps, np.repeat(lengths, element.rows)) for begins, lengths in places]
-        end = at + width * element.rows
-    else:
-        places, end = _walk(data, at, order, element, element.rows)
-    for each, (begins, lengths) in zip(element.properties, places, strict=True):
-        items = _gather(data, begins, lengths, order + each.scalar)
-        columns[element.name, each.name] = _Column(lengths, items)
+    found, end = _walk(data, at, order, element, 1)
+    size = (end - at) * element.rows
+    alike = _table(data, at, order, element, found) if size <= len(data) - at else None
+    found, end = (alike, at + size) if alike else _walk(data, at, order, element, element.rows)
+    for each, (lengths, items) in zip(element.properties, found, strict=True):
+        columns[element.name, each.name] = _Column(np.asarray(lengths, np.int64), np.asarray(items, np.float64))
     return end
 
 
-_Places = list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]
-"""Of each property: the byte at which its items begin in each row, and their number."""
+_Lists = list[tuple[Sequence[int] | npt.NDArray[Any], Sequence[float] | npt.NDArray[Any]]]
+"""Of each property: the lists' lengths, one a row, and their items, end to end."""
 
 
-def _walk(data: bytes, at: int, order: str, element: _Element, rows: int) -> tuple[_Places, int]:
-    """Where the items of the next rows lie, and the byte after them."""
+def _table(data: bytes, at: int, order: str, element: _Element, first: _Lists) -> _Lists | None:
+    """The usual case: rows laid out as the first one, whose lists are of its lengths; None of others."""
+    row: list[tuple[Any, ...]] = []
+    for k, (each, (_, items)) in enumerate(zip(element.properties, first, strict=True)):
+        row += [(f"length {k}", order + each.count)] if each.count else []
+        row += [(f"items {k}", order + each.scalar, (len(items),))]
+    try:
+        table = np.frombuffer(data, np.dtype(row), element.rows, at)
+    except ValueError:  # rows of gigabytes
+        return None
+    for k, (each, (_, items)) in enumerate(zip(element.properties, first, strict=True)):
+        if each.count and (table[f"length {k}"] != len(items)).any():
+            return None
+    return [(np.full(len(table), len(items)), table[f"items {k}"].ravel()) for k, (_, items) in enumerate(first)]
+
+
+def _walk(data: bytes, at: int, order: str, element: _Element, rows: int) -> tuple[_Lists, int]:
+    """The next rows one by one, and the byte after them."""
     readers = [each.count and struct.Struct(order + each.count) for each in element.properties]
-    sizes = [struct.calcsize(order + each.scalar) for each in element.properties]
-    found = [(array("q"), array("q")) for _ in sizes]
+    found = [(array("q"), array("d")) for _ in readers]
     for _ in range(rows):
-        for reader, size, (begins, lengths) in zip(readers, sizes, found, strict=True):
+        for each, reader, (lengths, items) in zip(element.properties, readers, found, strict=True):
             length = 1
             if reader:
                 _check_room(data, at, reader.size, element)
@@ -220,26 +221,12 @@ def _walk(data: bytes, at: int, order: str, element: _Element, rows: int) -> tup
                 if not 0 <= number < 2**31 or number != int(number):
                     raise _BadPlyError(f"it has a list of {number:g} items")
                 length = int(number)
-            _check_room(data, at, length * size, element)
-            begins.append(at)
+            size = length * struct.calcsize(order + each.scalar)
+            _check_room(data, at, size, element)
             lengths.append(length)
-            at += length * size
-    return [(np.array(begins, np.int64), np.array(lengths, np.int64)) for begins, lengths in found], at
-
-
-def _gather(
-    data: bytes, begins: npt.NDArray[np.int64], lengths: npt.NDArray[np.int64] | None, code: str
-) -> npt.NDArray[np.float64]:
-    """The numbers that begin at these bytes: runs of these lengths (default: 1), end to end."""
-    kind = np.dtype(code)
-    if lengths is not None:
-        within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-        begins = np.repeat(begins, lengths) + within * kind.itemsize
-    each_byte = np.frombuffer(data, np.uint8)
-    picked = np.empty((len(begins), kind.itemsize), np.uint8)
-    for byte in range(kind.itemsize):
-        picked[:, byte] = each_byte[begins + byte]
-    return picked.view(kind).ravel().astype(np.float64)
+            items.extend(struct.unpack_from(f"{order}{length}{each.scalar}", data, at))
+            at += size
+    return found, at
 
 
 def _check_room(data: bytes, at: int, needed: int, element: _Element) -> None:

@@ -7,7 +7,7 @@ The sizes are those of such things: a desk is 750 mm high, an exercise ball 650 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
@@ -17,39 +17,41 @@ import numpy.typing as npt
 
 from selective_depth.drivers.virtual.renderer import CYLINDER, DISC, QUAD, SPHERE, TORUS, Shapes
 
-Vector = tuple[float, float, float]
+Vector = Sequence[float] | npt.NDArray[np.float64]
+"""Three numbers."""
 
 
 class Material(IntEnum):
-    """What a surface is made of; its share of returned infrared light is in `ALBEDO`."""
+    """What a surface is made of: its number, `albedo` and `tint`; chosen, not measured.
 
-    NONE = 0
-    WALL = 1
-    FLOOR = 2
-    WOOD = 3
-    PLASTIC = 4
-    BLACK = 5
-    SCREEN = 6
-    METAL = 7
-    PAINT = 8
-    RUBBER = 9
-    CLOTH = 10
+    Attributes
+    ----------
+    albedo : float
+        Share of the projector's light that returns from it, 0..1.
+    tint : (int, int, int)
+        Its red, green and blue in full light.
+    """
 
+    albedo: float
+    tint: tuple[int, int, int]
 
-ALBEDO = {
-    Material.NONE: 0.0,
-    Material.WALL: 0.85,
-    Material.FLOOR: 0.45,
-    Material.WOOD: 0.6,
-    Material.PLASTIC: 0.45,
-    Material.BLACK: 0.14,
-    Material.SCREEN: 0.055,
-    Material.METAL: 0.3,
-    Material.PAINT: 0.6,
-    Material.RUBBER: 0.5,
-    Material.CLOTH: 0.35,
-}
-"""Share of the projector's light that returns from a material, 0..1; chosen, not measured."""
+    NONE = 0, 0.0, (12, 13, 16)
+    WALL = 1, 0.85, (214, 206, 190)
+    FLOOR = 2, 0.45, (122, 112, 104)
+    WOOD = 3, 0.6, (176, 128, 82)
+    PLASTIC = 4, 0.45, (92, 96, 104)
+    BLACK = 5, 0.14, (38, 38, 42)
+    SCREEN = 6, 0.055, (34, 84, 132)
+    METAL = 7, 0.3, (158, 164, 170)
+    PAINT = 8, 0.6, (186, 52, 44)
+    RUBBER = 9, 0.5, (52, 118, 190)
+    CLOTH = 10, 0.35, (66, 128, 92)
+
+    def __new__(cls, number: int, albedo: float, tint: tuple[int, int, int]) -> Material:
+        """A member that is its number."""
+        member = int.__new__(cls, number)
+        member._value_, member.albedo, member.tint = number, albedo, tint
+        return member
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ class Builder:
             for sign in (1.0, -1.0):
                 middle = np.array(centre) + sign * size[k] / 2 * turn[:, k]
                 first, second = turn[:, one], sign * turn[:, two]
-                self.quad(material, vector_of(middle), vector_of(first), vector_of(second), size[one], size[two])
+                self.quad(material, middle, first, second, size[one], size[two])
 
     def sphere(self, material: Material, centre: Vector, radius: float) -> None:
         """A ball."""
@@ -109,7 +111,7 @@ class Builder:
         """A cylinder with flat, round or open ends."""
         a, b = np.array(start), np.array(end)
         length = float(np.linalg.norm(b - a))
-        axis, middle = vector_of((b - a) / length), vector_of((a + b) / 2)
+        axis, middle = (b - a) / length, (a + b) / 2
         self._add(CYLINDER, material, middle, axis, size=(radius, length / 2))
         for point in (start, end):
             if ends == "flat":
@@ -119,9 +121,7 @@ class Builder:
 
     def ring(self, material: Material, centre: Vector, axis: Vector, middle: float, tube: float) -> None:
         """A torus."""
-        length = math.hypot(*axis)
-        unit = (axis[0] / length, axis[1] / length, axis[2] / length)
-        self._add(TORUS, material, centre, unit, size=(middle, tube))
+        self._add(TORUS, material, centre, np.array(axis) / math.hypot(*axis), size=(middle, tube))
 
     def chain(self, material: Material, points: list[Vector], radius: float) -> None:
         """A hose: round rods from point to point."""
@@ -142,20 +142,8 @@ class Builder:
 
     def shapes(self) -> Shapes:
         """All that was added."""
-        kind, material, centre, first, second, size = zip(*self._rows, strict=True)
-        return Shapes(
-            np.array(kind, np.int64),
-            np.array(material, np.int64),
-            np.array(centre, np.float64),
-            np.array(first, np.float64),
-            np.array(second, np.float64),
-            np.array(size, np.float64),
-        )
-
-
-def vector_of(vector: npt.NDArray[np.float64]) -> Vector:
-    """An array of three numbers as a tuple."""
-    return float(vector[0]), float(vector[1]), float(vector[2])
+        kind, material, *vectors = zip(*self._rows, strict=True)
+        return Shapes(np.array(kind), np.array(material), *(np.array(each, np.float64) for each in vectors))
 
 
 def turn_of(yaw: float, pitch: float) -> npt.NDArray[np.float64]:
@@ -186,11 +174,11 @@ def workstation() -> Scene:
         turn = turn_of(yaw, 0)
         foot = np.array((x, desk, 2270.0))
         b.box(Material.PLASTIC, (x, desk - 8, 2270), (240, 16, 190), yaw)
-        b.box(Material.PLASTIC, vector_of(foot + turn @ (0, -110, 40)), (70, 200, 30), yaw)
+        b.box(Material.PLASTIC, foot + turn @ (0, -110, 40), (70, 200, 30), yaw)
         middle = foot + turn @ (0, -290, 0)
-        b.box(Material.PLASTIC, vector_of(middle), (540, 345, 40), yaw)
+        b.box(Material.PLASTIC, middle, (540, 345, 40), yaw)
         screen = middle + turn @ (0, 0, -20.5)
-        b.quad(Material.SCREEN, vector_of(screen), vector_of(turn[:, 1]), vector_of(turn[:, 0]), 300, 500)
+        b.quad(Material.SCREEN, screen, turn[:, 1], turn[:, 0], 300, 500)
     # On the desk.
     b.box(Material.BLACK, (-60, desk - 12, 1900), (450, 24, 150), 4, 4)
     b.rod(Material.PLASTIC, (290, desk - 18, 1900), (300, desk - 18, 1945), 19, "round")
@@ -215,7 +203,7 @@ def workstation() -> Scene:
     chair = np.array((430, floor, 1520.0))
 
     def on_chair(x: float, y: float, z: float) -> Vector:
-        return vector_of(chair + turn @ np.array((x, -y, z)))
+        return chair + turn @ (x, -y, z)
 
     b.box(Material.CLOTH, on_chair(0, 470, 0), (470, 80, 450), -28)
     b.box(Material.CLOTH, on_chair(0, 800, -235), (440, 480, 60), -28, -8)
@@ -244,10 +232,10 @@ def exercise_ball() -> Scene:
     for x, z, yaw in ((-560, 1500, 35), (520, 1420, -60)):
         turn = turn_of(yaw, 0)
         grip = np.array((x, floor - 62, float(z)))
-        b.rod(Material.METAL, vector_of(grip - turn[:, 0] * 75), vector_of(grip + turn[:, 0] * 75), 15)
+        b.rod(Material.METAL, grip - turn[:, 0] * 75, grip + turn[:, 0] * 75, 15)
         for sign in (-1, 1):
             inner, outer = grip + sign * turn[:, 0] * 70, grip + sign * turn[:, 0] * 135
-            b.rod(Material.RUBBER, vector_of(inner), vector_of(outer), 52)
+            b.rod(Material.RUBBER, inner, outer, 52)
     # The door in its frame.
     b.box(Material.WOOD, (-1050, floor - 1000, 2535), (800, 2000, 20))
     for x in (-1490, -610):

@@ -17,11 +17,11 @@ from selective_depth.drivers.virtual.moving import MOVING, moving_shapes
 from selective_depth.drivers.virtual.noise import kinect_depth
 from selective_depth.drivers.virtual.paint import paint
 from selective_depth.drivers.virtual.renderer import cast
-from selective_depth.drivers.virtual.scenes import ALBEDO, ALIASES, SCENES, Material, Scene
+from selective_depth.drivers.virtual.scenes import ALIASES, SCENES, Material, Scene
 
 FPS = 30.0
 
-_ALBEDO = np.array([ALBEDO[stuff] for stuff in Material], np.float32)
+_ALBEDO = np.array([stuff.albedo for stuff in Material], np.float32)
 
 # A hand's path: wide and slow, narrow and faster, tremor. Hertz, share of the scene's sway.
 _HAND = ((0.071, 0.75), (0.19, 0.25), (1.3, 0.008))

@@ -127,8 +127,8 @@ HEADER = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty fl
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", "is no PLY file"),
-        ("plynth\n", "is no PLY file"),
+        ("", "is not a PLY file"),
+        ("plynth\n", "is not a PLY file"),
         ("ply\nformat ascii 1.0\n", "header has no end"),
         ("ply\nend_header\n1 2 3\n", "names no format"),
         ("ply\nformat morse 1.0\nend_header\n", "format morse"),
