@@ -20,20 +20,21 @@ from PIL import Image
 
 from selective_depth.drivers.colour import BOMBS, DAMAGED
 from selective_depth.drivers.errors import DamagedRecordingError
-from selective_depth.drivers.frame import DepthArray
 
 SUFFIXES: Final = (".png", ".pgm", ".tif", ".tiff", ".exr", ".npy", ".npz")
 MAX_SIDE: Final = 8192
 MAX_FILE_BYTES: Final = 256 * 1024 * 1024
 MAX_STACK_BYTES: Final = 16 << 30
 
-_MODES: Final = {"1": "a 1-bit grey", "L": "an 8-bit grey", "P": "a palette", "LA": "an 8-bit grey + alpha",
+_GREY: Final = ("I;16", "I;16B", "I", "F")
+"""Pillow's modes of depth images; of PNG files, the first."""
+_COLOURS: Final = {"1": "a black-and-white", "L": "an 8-bit grey", "P": "a palette", "LA": "an 8-bit grey + alpha",
                 "RGB": "a colour", "RGBA": "a colour + alpha"}  # fmt: skip
-_NEXT: Final = "depth frames are 16-bit grey PNG; convert this file or remove it from the folder"
+_NEXT: Final = "depth images are grey, of 16 bits or floating point; convert this file or remove it from the folder"
 
 
 def is_depth_png(path: Path) -> bool:
-    """Whether an image is no picture for people: no PNG file of 8 bits or in colour."""
+    """Whether an image is not a picture for people, a PNG file of 8 bits or in colour."""
     with path.open("rb") as file:
         header = file.read(26)
     return not header.startswith(b"\x89PNG") or header[24:26] == b"\x10\x00"
@@ -52,37 +53,33 @@ def read_raw(path: Path) -> npt.NDArray[Any]:
         Naming the file and what is wrong with it.
     """
     suffix = path.suffix.lower()
-    if suffix == ".png":
-        return read_png(path)
     if suffix in (".npy", ".npz"):
         stack = read_stack(path)
         if len(stack) != 1:
             raise DamagedRecordingError(
-                f"'{path}' holds {len(stack)} frames; one a file in a folder, or give it alone."
+                f"'{path}' holds {len(stack)} frames; each file of a folder is one frame. Open it by its own name."
             )
         return np.array(stack[0])
     if suffix == ".exr":
-        raw = _exr(path)
-    else:
-        try:
-            with Image.open(io.BytesIO(_read_bytes(path, MAX_FILE_BYTES)), formats=("TIFF", "PPM")) as image:
-                good = image.mode in ("I;16", "I;16B", "I", "F") and max(image.size) <= MAX_SIDE
-                raw = np.array(image, None if image.mode == "F" else np.uint16) if good else None
-        except (*DAMAGED, *BOMBS):
-            raw = None
-    if raw is None or raw.ndim != 2:
-        raise DamagedRecordingError(
-            f"'{path}' is damaged or cut off, or no depth image: those are grey, of 16 bits or floating point."
-        )
-    return raw
+        return _read_exr(path)
+    with opened(path, _NEXT) as file:
+        data = io.BytesIO(file.read(MAX_FILE_BYTES))
+    try:
+        with _header(path, data) as image:
+            image.verify()
+        with Image.open(data) as image:
+            return np.array(image, None if image.mode == "F" else np.uint16)
+    except DAMAGED as error:
+        raise _damaged(path, error) from error
 
 
 def read_size(path: Path) -> tuple[int, int]:
-    """Height and width of a depth image; of a PNG file, from its first bytes only."""
-    if path.suffix.lower() == ".png":
-        return read_png_size(path)
-    height, width = read_raw(path).shape
-    return height, width
+    """Height and width of a depth image; of a PNG, TIFF or PGM file, from its first bytes only."""
+    if path.suffix.lower() in (".npy", ".npz", ".exr"):
+        height, width = read_raw(path).shape
+        return height, width
+    with opened(path, _NEXT) as file, _header(path, file) as image:
+        return image.height, image.width
 
 
 def read_stack(path: Path) -> npt.NDArray[Any]:
@@ -135,7 +132,7 @@ def _unpacked(path: Path, name: str) -> npt.NDArray[Any]:
     return np.asarray(np.lib.format.read_array(data, allow_pickle=False))
 
 
-def _exr(path: Path) -> npt.NDArray[Any] | None:
+def _read_exr(path: Path) -> npt.NDArray[Any]:
     try:
         import OpenEXR
     except ImportError:
@@ -144,49 +141,10 @@ def _exr(path: Path) -> npt.NDArray[Any] | None:
         ) from None
     try:
         channels = OpenEXR.File(str(path), separate_channels=True).channels()
-    except (RuntimeError, ValueError, OSError):
-        return None
+    except (RuntimeError, ValueError, OSError) as error:
+        raise _damaged(path, error) from error
     name = next((n for n in ("Z", "Y", "R", "V") if n in channels), None) or next(iter(channels))
     return np.asarray(channels[name].pixels, np.float32)
-
-
-def read_png_size(path: Path) -> tuple[int, int]:
-    """Height and width of a 16-bit grey PNG, from its first bytes only.
-
-    Raises
-    ------
-    DamagedRecordingError
-        If the file cannot be read or is no 16-bit grey PNG of a sensible size.
-    """
-    with _opened(path) as file, _png(path, file) as image:
-        return image.height, image.width
-
-
-def read_png(path: Path) -> DepthArray:
-    """Raw values of a 16-bit grey PNG.
-
-    Its checksums are verified first. Pillow does both: OpenCV prints to stderr on damaged files, and
-    some of its versions deliver half of a truncated one as if it were whole.
-
-    Returns
-    -------
-    uint16 array of shape (height, width)
-
-    Raises
-    ------
-    DamagedRecordingError
-        Naming the file, what was expected and what was found.
-    """
-    data = io.BytesIO(_read_bytes(path, MAX_FILE_BYTES))
-    try:
-        with _png(path, data) as image:
-            image.verify()
-        with Image.open(data) as image:
-            return np.array(image, np.uint16)
-    except DAMAGED as error:
-        raise DamagedRecordingError(
-            f"'{path}' is damaged or cut off ({error}); copy it again, or remove it from the folder."
-        ) from error
 
 
 def write_png(path: Path, raw: npt.NDArray[Any], compression: int = 3) -> None:
@@ -208,16 +166,24 @@ def write_png(path: Path, raw: npt.NDArray[Any], compression: int = 3) -> None:
     path.write_bytes(encoded.tobytes())
 
 
-def _read_bytes(path: Path, limit: int) -> bytes:
-    with _opened(path) as file:
-        return file.read(limit)
+def opened(path: Path, remedy: str) -> BinaryIO:
+    """A file of a recorded folder, open for reading.
 
+    Parameters
+    ----------
+    path : Path
+    remedy : str
+        What to do about something that is not a regular file, such as a pipe.
 
-def _opened(path: Path) -> BinaryIO:
+    Raises
+    ------
+    DamagedRecordingError
+        If it is not a regular file or cannot be opened.
+    """
     try:
         # Opening a pipe or a device in the folder would wait for ever.
         if not path.is_file():
-            raise DamagedRecordingError(f"'{path}' is no regular file; {_NEXT}.")
+            raise DamagedRecordingError(f"'{path}' is not a regular file; {remedy}.")
         return path.open("rb")
     except OSError as error:
         raise DamagedRecordingError(
@@ -225,10 +191,15 @@ def _opened(path: Path) -> BinaryIO:
         ) from error
 
 
-def _png(path: Path, file: BinaryIO) -> Image.Image:
-    """A PNG file's image, of which only the header was read, if it can be depth."""
+def _header(path: Path, file: BinaryIO) -> Image.Image:
+    """An image of which only the header was read, if it can be depth.
+
+    Pillow reads it: OpenCV prints to stderr on damaged files, and some of its versions deliver half
+    of a truncated one as if it were whole.
+    """
+    formats, modes = (("PNG",), _GREY[:1]) if path.suffix.lower() == ".png" else (("TIFF", "PPM"), _GREY)
     try:
-        image = Image.open(file, formats=("PNG",))
+        image = Image.open(file, formats=formats)
     except BOMBS as error:
         raise DamagedRecordingError(
             f"'{path}' claims to be larger ({error}) than is allowed, 1 to {MAX_SIDE} pixels each way."
@@ -236,16 +207,23 @@ def _png(path: Path, file: BinaryIO) -> Image.Image:
     except DAMAGED:
         file.seek(0)
         start = file.read(24)
-        what = (
-            "cut off" if start.startswith(b"\x89PNG") else "no PNG file, whatever its name says" if start else "empty"
-        )
-        if start.startswith(b"version https://git-lfs"):
+        what = f"not a {' or '.join(formats)} file, whatever its name says"
+        if start.startswith((b"\x89PNG", b"II*\0", b"MM\0*", b"P5")):
+            what = "cut off"
+        elif start.startswith(b"version https://git-lfs"):
             what = "a Git LFS pointer and not the image; `git lfs pull` fetches it"
-        raise DamagedRecordingError(f"'{path}' is {what}; {_NEXT}.") from None
-    if image.mode != "I;16":
-        raise DamagedRecordingError(f"'{path}' is {_MODES.get(image.mode, f'a {image.mode}')} PNG; {_NEXT}.")
+        raise DamagedRecordingError(f"'{path}' is {what if start else 'empty'}; {_NEXT}.") from None
+    if image.mode not in modes:
+        what = _COLOURS.get(image.mode, f"a {image.mode}")
+        raise DamagedRecordingError(f"'{path}' is {what} {image.format}; {_NEXT}.")
     if max(image.size) > MAX_SIDE:
         raise DamagedRecordingError(
             f"'{path}' claims to be {image.width}x{image.height} pixels; allowed are 1 to {MAX_SIDE} each way."
         )
     return image
+
+
+def _damaged(path: Path, error: Exception) -> DamagedRecordingError:
+    return DamagedRecordingError(
+        f"'{path}' is damaged or cut off ({error}); copy it again, or remove it from the folder."
+    )

@@ -7,7 +7,7 @@ it cannot lead outside the folder.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import suppress
@@ -23,12 +23,10 @@ from selective_depth.drivers.folder.cameras import CameraFile, find_camera_file
 from selective_depth.drivers.folder.colours import Colours
 from selective_depth.drivers.folder.images import read_raw, read_size, read_stack
 from selective_depth.drivers.folder.layouts import ARRAYS, Found, doubtful_order, find_layout
-from selective_depth.drivers.folder.sidecar import SIDECAR, Sidecar, read_sidecar
+from selective_depth.drivers.folder.sidecar import DEFAULT_FPS, MILLIMETRES, SIDECAR, Sidecar, read_sidecar
 from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame, millimetres
 from selective_depth.drivers.source import DepthSource
 
-_MILLIMETRES: Final = 1000.0
-_DEFAULT_FPS: Final = 30.0
 _LOOKS: Final = 5
 """Frames that are looked at before a scale that is only the custom is believed."""
 _NEAREST_M, _NEAR_M = 0.4, 0.8
@@ -205,7 +203,7 @@ class RecordedFolder(DepthSource):
         return Camera.kinect(width, height), "assumed, a Kinect's"
 
     def _conversion(
-        self, said: float | None, where: str, marks: Iterable[int]
+        self, said: float | None, where: str, marks: tuple[int, ...]
     ) -> tuple[Callable[[npt.NDArray[Any]], DepthArray], str]:
         """How raw values become millimetres, and that in words.
 
@@ -215,29 +213,36 @@ class RecordedFolder(DepthSource):
             If the scale is only the custom, and what it makes of the frames cannot be.
         """
         row = self.found.row
-        where = where if said else "assumed" if row.assumed else f"the {row.name} layout's"
         png = self._stack is None and self._files[0].suffix.lower() == ".png"
         kind = np.dtype(np.uint16) if png else self._raw(0).dtype
-        look = said is None and (row.assumed or kind.kind == "f")
-        seen = self._look() if look else np.empty(0)
-        if kind.kind == "f":
-            scale = said or (_MILLIMETRES if seen.size and np.median(seen) > _FARTHEST_M else 1.0)
-            where = where if said else "told by their size"
-            names = {1.0: "metres", _MILLIMETRES: "millimetres"}
-            words = f"{names.get(scale, f'{scale:g} values a metre')} in floating point ({where})"
-        elif row.convert is not None and said is None:
-            convert = row.convert
-            table = convert(np.arange(65536, dtype=np.float64))
-            return _by_table(table, marks), f"its own coding of millimetres ({where})"
+        floating = kind.kind == "f"
+        seen = self._look() if said is None and (row.assumed or floating) else np.empty(0)
+        coding = None
+        if said is not None:
+            scale = said
+        elif floating:
+            scale = MILLIMETRES if seen.size and np.median(seen) > _FARTHEST_M else 1.0
+            where = "told by their size"
         else:
-            scale = said or row.values_per_metre
+            scale, coding = (row.values_per_metre, None) if row.convert is None else (MILLIMETRES, row.convert)
+            where = "assumed" if row.assumed else f"the {row.name} layout's"
+        if floating:
+            names = {1.0: "metres", MILLIMETRES: "millimetres"}
+            words = f"{names.get(scale, f'{scale:g} values a metre')} in floating point ({where})"
+        elif coding is not None:
+            words = f"its own coding of millimetres ({where})"
+        else:
+            words = f"{scale:g} values a metre ({where})"
             if seen.size:
                 self._doubt(seen / scale, scale)
-            words = f"{scale:g} values a metre ({where})"
-        if kind == np.uint16:
-            values = np.arange(65536, dtype=np.float64)
-            return _by_table(np.rint(values * (_MILLIMETRES / scale)), marks), words
-        return lambda raw: millimetres(raw, scale, tuple(marks)), words
+        if kind != np.uint16:
+            return lambda raw: millimetres(raw, scale, marks), words
+        values = np.arange(65536, dtype=np.float64)
+        table = millimetres(coding(values) if coding else values, scale)
+        table[list(marks)] = 0
+        if np.array_equal(table, values):
+            return lambda raw: raw, words  # millimetres as they stand
+        return lambda raw: table[raw], words
 
     def _look(self) -> npt.NDArray[Any]:
         """What some frames measured; those that are damaged say so when they are read."""
@@ -250,7 +255,7 @@ class RecordedFolder(DepthSource):
 
     def _doubt(self, seen_m: npt.NDArray[np.float64], scale: float) -> None:
         near_m, median_m = np.percentile(seen_m, (5, 50))
-        if scale == _MILLIMETRES:
+        if scale == MILLIMETRES:
             if median_m > _FAR_M:
                 self.notes += (
                     f"half of what '{self.uri}' shows is beyond {median_m:.3g} m, if its values are"
@@ -285,19 +290,6 @@ def _size_error(path: Path, shape: tuple[int, ...], camera: Camera) -> DamagedRe
 def _fps_from(timestamps_us: tuple[int, ...] | None) -> float:
     """Frame rate from the median distance of the timestamps, 30 where they say nothing."""
     if timestamps_us is None or len(timestamps_us) < 2:
-        return _DEFAULT_FPS
+        return DEFAULT_FPS
     step_us = float(np.median(np.diff(np.asarray(timestamps_us, dtype=np.float64))))
-    return round(1e6 / step_us, 3) if 1e3 <= step_us <= 1e9 else _DEFAULT_FPS
-
-
-def _by_table(depth_mm: npt.NDArray[np.float64], marks: Iterable[int]) -> Callable[[npt.NDArray[Any]], DepthArray]:
-    """Conversion of 16-bit values by a table of millimetres.
-
-    Values beyond 65,535 mm cannot be held and become 0, no measurement.
-    """
-    depth_mm[depth_mm > 65535] = 0
-    depth_mm[list(marks)] = 0
-    if np.array_equal(depth_mm, np.arange(65536)):
-        return lambda raw: raw  # millimetres as they stand
-    table: DepthArray = np.rint(depth_mm).astype(np.uint16)
-    return lambda raw: table[raw]
+    return round(1e6 / step_us, 3) if 1e3 <= step_us <= 1e9 else DEFAULT_FPS

@@ -27,22 +27,26 @@ Every entry may be left out. TOML is read by the standard library and can only h
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import tomli_w
 
 from selective_depth.drivers.errors import DamagedRecordingError
-from selective_depth.drivers.folder.images import MAX_SIDE
+from selective_depth.drivers.folder.images import MAX_SIDE, opened
 from selective_depth.drivers.frame import MOST_PX, MOST_TIME_US, Camera
 
 SIDECAR: Final = "frames.toml"
 
 SCHEMA: Final = 1
+MILLIMETRES: Final = 1000.0
+"""Values per metre, where nothing is said."""
+DEFAULT_FPS: Final = 30.0
 
 _MAX_TEXT_BYTES: Final = 16 * 1024 * 1024
-_CAMERA_KEYS: Final = ("width", "height", "fx", "fy", "cx", "cy")
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,7 @@ def read_sidecar(folder: Path) -> Sidecar:
     Raises
     ------
     DamagedRecordingError
-        If it is no TOML, or an entry is unknown or wrong, naming the entry and what is allowed.
+        If it is not TOML, or an entry is unknown or wrong, naming the entry and what is allowed.
     """
     path = folder / SIDECAR
     if not path.exists():
@@ -100,40 +104,30 @@ def read_sidecar(folder: Path) -> Sidecar:
         entries = tomllib.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise DamagedRecordingError(
-            f"'{path}' is no valid TOML ({str(error) or 'nested too deep'}); correct it, or remove it to use defaults."
+            f"'{path}' is not valid TOML ({str(error) or 'nested too deep'}); correct it, or remove it to use defaults."
         ) from error
-    known = Sidecar.__dataclass_fields__
-    if not _is_integer(schema := entries.get("schema", SCHEMA)) or schema > SCHEMA:
-        raise _wrong(path, "schema", schema, f"up to {SCHEMA}; a later version of this program wrote it, use that")
-    for name in entries:
-        if name not in known:
-            raise _wrong(path, name, "no such entry", f"one of {', '.join(known)}")
-    return Sidecar(
-        values_per_metre=_number(path, entries, "values_per_metre", 1e-2, 1e6),
-        camera=_camera(path, entries, "camera"),
-        fps=_number(path, entries, "fps", 1e-3, 1e4),
-        missing=_integers(path, entries, "missing", 0, 65535),
-        timestamps_us=_integers(path, entries, "timestamps_us", -MOST_TIME_US, MOST_TIME_US),
-        colour_registered=_truth(path, entries, "colour_registered"),
-        colour_camera=_camera(path, entries, "colour_camera"),
-        colour_place_mm=_place(path, entries, "colour_place_mm"),
-        colour_timestamps_us=_integers(path, entries, "colour_timestamps_us", -MOST_TIME_US, MOST_TIME_US),
-    )
+    try:
+        schema = entries.pop("schema", SCHEMA)
+        if not isinstance(schema, int) or schema is True or schema > SCHEMA:
+            raise _WrongEntryError(
+                "schema", schema, f"up to {SCHEMA}; a later version of this program wrote it, use that"
+            )
+        for name in entries:
+            if name not in _ENTRIES:
+                raise _WrongEntryError(name, "no such entry", f"one of {', '.join(Sidecar.__dataclass_fields__)}")
+        return Sidecar(**{name: _ENTRIES[name](name, value) for name, value in entries.items()})
+    except _WrongEntryError as error:
+        name, got, allowed = error.args
+        try:
+            shown = f"{got!s:.80}"
+        except ValueError:  # Python refuses to print whole numbers of thousands of digits
+            shown = "a number too long to print"
+        raise DamagedRecordingError(f"'{name:.40}' in '{path}' is wrong: got {shown}; allowed is {allowed}.") from None
 
 
 def write_sidecar(folder: Path, sidecar: Sidecar) -> None:
     """Write ``frames.toml``, whole or not at all."""
-    said: dict[str, Any] = {}
-    for name, value in vars(sidecar).items():
-        if isinstance(value, Camera):
-            sizes = {key: int(getattr(value, key)) for key in _CAMERA_KEYS[:2]}
-            said[name] = sizes | {key: float(getattr(value, key)) for key in _CAMERA_KEYS[2:]}
-        elif name == "colour_place_mm" and value is not None:
-            said[name] = [float(each) for each in value]
-        elif isinstance(value, tuple):
-            said[name] = [int(each) for each in value]  # NumPy's whole numbers too
-        elif value is not None:
-            said[name] = value if isinstance(value, bool) or name == "schema" else float(value)
+    said = {name: _plain(value) for name, value in vars(sidecar).items() if value is not None}
     text = "# Depth frames as 16-bit PNG: what the numbers in the files mean.\n"
     new = folder / f"{SIDECAR}.new"
     try:
@@ -150,84 +144,89 @@ def read_text(path: Path) -> str:
     Raises
     ------
     DamagedRecordingError
-        If it is no regular file, too large, unreadable or no UTF-8.
+        If it is not a regular file, too large, unreadable or not UTF-8.
     """
+    with opened(path, "remove it") as file:
+        data = file.read(_MAX_TEXT_BYTES + 1)
+    if len(data) > _MAX_TEXT_BYTES:
+        raise DamagedRecordingError(
+            f"'{path}' is larger than {_MAX_TEXT_BYTES // 2**20} MiB, which no sidecar is; remove it."
+        )
     try:
-        if not path.is_file():
-            raise DamagedRecordingError(f"'{path}' is no regular file; remove it.")
-        with path.open("rb") as file:
-            data = file.read(_MAX_TEXT_BYTES + 1)
-        if len(data) > _MAX_TEXT_BYTES:
-            raise DamagedRecordingError(
-                f"'{path}' is larger than {_MAX_TEXT_BYTES // 2**20} MiB, which no sidecar is; remove it."
-            )
         return data.decode("utf-8-sig")
-    except OSError as error:
-        raise DamagedRecordingError(f"'{path}' cannot be read ({error.strerror}); check its permissions.") from error
     except UnicodeDecodeError as error:
         raise DamagedRecordingError(
-            f"'{path}' is no UTF-8 text (byte {error.start}); correct it, or remove it."
+            f"'{path}' is not UTF-8 text (byte {error.start}); correct it, or remove it."
         ) from error
 
 
-def _camera(path: Path, entries: dict[str, Any], name: str) -> Camera | None:
-    table = entries.get(name)
-    if table is None:
-        return None
-    if not isinstance(table, dict) or set(table) != set(_CAMERA_KEYS):
-        raise _wrong(path, name, table, f"a table of exactly {', '.join(_CAMERA_KEYS)}")
-    for key in ("width", "height"):
-        if not _is_integer(table[key]) or not 1 <= table[key] <= MAX_SIDE:
-            raise _wrong(path, key, table[key], f"a whole number from 1 to {MAX_SIDE}")
-    for key in _CAMERA_KEYS[2:]:
-        _number(path, table, key, -MOST_PX, MOST_PX)
-    try:
-        return Camera(table["width"], table["height"], *(float(table[key]) for key in _CAMERA_KEYS[2:]))
-    except ValueError as error:
-        raise _wrong(path, name, error, "a camera that can be") from error
+def _plain(value: Any) -> Any:
+    """What TOML can hold: a table of a camera, a list of a tuple, Python's numbers of NumPy's."""
+    if isinstance(value, Camera):
+        return {key: _plain(getattr(value, key)) for key in _CAMERA}
+    if isinstance(value, tuple):
+        return [_plain(each) for each in value]
+    return value.item() if isinstance(value, np.generic) else value
 
 
-def _truth(path: Path, entries: dict[str, Any], name: str) -> bool | None:
-    value = entries.get(name)
-    if value is not None and not isinstance(value, bool):
-        raise _wrong(path, name, value, "true or false")
+class _WrongEntryError(Exception):
+    """An entry's name, what it is, and what is allowed."""
+
+
+_Check = Callable[[str, Any], Any]
+"""Takes the name of an entry and what TOML holds for it; returns its value, or raises `_WrongEntryError`."""
+
+
+def _number(least: float, most: float, whole: bool = False) -> _Check:
+    allowed = f"a {'whole ' * whole}number from {least} to {most}"
+
+    def check(name: str, value: Any) -> float:
+        right = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+        if not right or not least <= value <= most:
+            raise _WrongEntryError(name, value, allowed)
+        return value if whole else float(value)
+
+    return check
+
+
+def _several(each: _Check, allowed: str, count: int | None = None) -> _Check:
+    def check(name: str, values: Any) -> tuple[Any, ...]:
+        if not isinstance(values, list) or count not in (None, len(values)):
+            raise _WrongEntryError(name, values, allowed)
+        return tuple(each(name, value) for value in values)
+
+    return check
+
+
+def _flag(name: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise _WrongEntryError(name, value, "true or false")
     return value
 
 
-def _place(path: Path, entries: dict[str, Any], name: str) -> tuple[float, ...] | None:
-    values = entries.get(name)
-    if values is None:
-        return None
-    if not isinstance(values, list) or len(values) != 3:
-        raise _wrong(path, name, values, "a list of three numbers")
-    return tuple(_number(path, {name: each}, name, -MOST_PX, MOST_PX) or 0.0 for each in values)
-
-
-def _number(path: Path, entries: dict[str, Any], name: str, least: float, most: float) -> float | None:
-    value = entries.get(name)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-        raise _wrong(path, name, value, f"a number from {least:g} to {most:g}")
-    return float(value)
-
-
-def _integers(path: Path, entries: dict[str, Any], name: str, least: int, most: int) -> tuple[int, ...] | None:
-    values = entries.get(name)
-    if values is None:
-        return None
-    if not isinstance(values, list) or not all(_is_integer(value) and least <= value <= most for value in values):
-        raise _wrong(path, name, values, f"a list of whole numbers from {least} to {most}")
-    return tuple(values)
-
-
-def _is_integer(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _wrong(path: Path, name: str, got: object, allowed: str) -> DamagedRecordingError:
+def _camera(name: str, value: Any) -> Camera:
+    if not isinstance(value, dict) or set(value) != set(_CAMERA):
+        raise _WrongEntryError(name, value, f"a table of exactly {', '.join(_CAMERA)}")
+    numbers = {key: check(key, value[key]) for key, check in _CAMERA.items()}
     try:
-        shown = f"{got!s:.80}"
-    except ValueError:  # Python refuses to print whole numbers of thousands of digits
-        shown = "a number too long to print"
-    return DamagedRecordingError(f"'{name:.40}' in '{path}' is wrong: got {shown}; allowed is {allowed}.")
+        return Camera(**numbers)
+    except ValueError as error:
+        raise _WrongEntryError(name, error, "a camera that can be") from error
+
+
+_PX = _number(-MOST_PX, MOST_PX)
+_SIDE = _number(1, MAX_SIDE, whole=True)
+_TIMES = _several(_number(-MOST_TIME_US, MOST_TIME_US, whole=True), "a list of whole numbers")
+_CAMERA: Final = {"width": _SIDE, "height": _SIDE, "fx": _PX, "fy": _PX, "cx": _PX, "cy": _PX}
+_ENTRIES: Final[dict[str, _Check]] = {
+    "values_per_metre": _number(1e-2, 1e6),
+    "camera": _camera,
+    "fps": _number(1e-3, 1e4),
+    "missing": _several(_number(0, 65535, whole=True), "a list of whole numbers"),
+    "timestamps_us": _TIMES,
+    "colour_registered": _flag,
+    "colour_camera": _camera,
+    "colour_place_mm": _several(_PX, "a list of three numbers", 3),
+    "colour_timestamps_us": _TIMES,
+}
+"""What each entry may be."""

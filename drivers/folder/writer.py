@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, Self
@@ -12,13 +12,11 @@ import cv2
 
 from selective_depth.drivers.errors import OutputError
 from selective_depth.drivers.folder.images import write_png
-from selective_depth.drivers.folder.sidecar import SIDECAR, Sidecar, write_sidecar
+from selective_depth.drivers.folder.sidecar import DEFAULT_FPS, MILLIMETRES, SIDECAR, Sidecar, write_sidecar
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.source import DepthSource
 
 COLOUR: Final = "colour"
-_MILLIMETRES: Final = 1000.0
-_DEFAULT_FPS: Final = 30.0
 
 
 class FolderWriter:
@@ -43,18 +41,16 @@ class FolderWriter:
         If the folder cannot be made or written, or is in use.
     """
 
-    def __init__(self, path: str | Path, *, fps: float = _DEFAULT_FPS, compression: int = 3) -> None:
+    def __init__(self, path: str | Path, *, fps: float = DEFAULT_FPS, compression: int = 3) -> None:
         self.path = Path(path)
         self._compression = compression
-        self._sidecar = Sidecar(values_per_metre=_MILLIMETRES, fps=fps)
+        self._sidecar = Sidecar(values_per_metre=MILLIMETRES, fps=float(fps))
         self._timestamps_us: list[int] = []
         self._colour_us: list[int] = []
         self._made = not self.path.exists()
-        try:
+        with _writing(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
             used = any(entry.suffix.lower() == ".png" or entry.name == SIDECAR for entry in self.path.iterdir())
-        except OSError as error:
-            raise _output_error(self.path, error) from error
         if used:
             raise OutputError(f"'{self.path}' holds frames already; give a new or an empty folder.")
 
@@ -79,18 +75,19 @@ class FolderWriter:
         if frame.colour is not None and self._sidecar.colour_registered is None:
             camera = None if frame.registered else frame.colour_camera
             self._sidecar = replace(self._sidecar, colour_registered=frame.registered, colour_camera=camera)
-        file = self._file(len(self._timestamps_us))
-        try:
-            write_png(file, frame.depth_mm, self._compression)
-            if frame.colour is not None:
-                (self.path / COLOUR).mkdir(exist_ok=True)
-                # Lossless, and as quick as it can be: noise hardly packs.
-                write_png(self.path / COLOUR / file.name, cv2.cvtColor(frame.colour, cv2.COLOR_RGB2BGR), 1)
-        except OSError as error:
-            # Half a file would make the whole folder unreadable.
-            file.unlink(missing_ok=True)
-            (self.path / COLOUR / file.name).unlink(missing_ok=True)
-            raise _output_error(file, error) from error
+        depth, colour = self._files(len(self._timestamps_us))
+        with _writing(depth):
+            try:
+                write_png(depth, frame.depth_mm, self._compression)
+                if frame.colour is not None:
+                    colour.parent.mkdir(exist_ok=True)
+                    # Lossless, and as quick as it can be: noise hardly packs.
+                    write_png(colour, cv2.cvtColor(frame.colour, cv2.COLOR_RGB2BGR), 1)
+            except OSError:
+                # Half a file would make the whole folder unreadable.
+                depth.unlink(missing_ok=True)
+                colour.unlink(missing_ok=True)
+                raise
         self._timestamps_us.append(frame.timestamp_us)
         self._colour_us.append(frame.colour_us or 0)
 
@@ -106,8 +103,8 @@ class FolderWriter:
     def discard(self) -> None:
         """Remove what was written, so that it is not in the way of the next attempt."""
         for index in range(len(self._timestamps_us)):
-            self._file(index).unlink(missing_ok=True)
-            (self.path / COLOUR / self._file(index).name).unlink(missing_ok=True)
+            for file in self._files(index):
+                file.unlink(missing_ok=True)
         (self.path / SIDECAR).unlink(missing_ok=True)
         self._timestamps_us.clear()
         with suppress(OSError):  # somebody else has put something there meanwhile
@@ -124,14 +121,14 @@ class FolderWriter:
             self.discard()  # a source that failed leaves what it gave; a writer, nothing
         self.close()
 
-    def _file(self, index: int) -> Path:
-        return self.path / f"{index:06d}.png"
+    def _files(self, index: int) -> tuple[Path, Path]:
+        """Where a frame's depth and colour go."""
+        name = f"{index:06d}.png"
+        return self.path / name, self.path / COLOUR / name
 
     def _write_sidecar(self) -> None:
-        try:
+        with _writing(self.path / SIDECAR):
             write_sidecar(self.path, self._sidecar)
-        except OSError as error:
-            raise _output_error(self.path / SIDECAR, error) from error
 
 
 def write_folder(
@@ -161,7 +158,7 @@ def write_folder(
         If the folder cannot be written.
     """
     if fps is None:
-        fps = frames.fps if isinstance(frames, DepthSource) else _DEFAULT_FPS
+        fps = frames.fps if isinstance(frames, DepthSource) else DEFAULT_FPS
     count = 0
     with FolderWriter(path, fps=fps, compression=compression) as folder:
         for frame in frames:
@@ -170,8 +167,13 @@ def write_folder(
     return count
 
 
-def _output_error(path: Path, error: OSError) -> OutputError:
-    return OutputError(
-        f"'{path}' cannot be written ({error.strerror}); check the folder's permissions and the"
-        " free space, or choose another folder."
-    )
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Give what the system does not let us write the name of `OutputError`."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"'{path}' cannot be written ({error.strerror}); check the folder's permissions and the"
+            " free space, or choose another folder."
+        ) from error

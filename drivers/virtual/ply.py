@@ -187,7 +187,7 @@ def _read_element(data: bytes, at: int, order: str, element: _Element, columns: 
     return end
 
 
-_Lists = list[tuple[Sequence[int] | npt.NDArray[Any], Sequence[float] | npt.NDArray[Any]]]
+_Lists = Sequence[tuple[Sequence[int] | npt.NDArray[Any], Sequence[float] | npt.NDArray[Any]]]
 """Of each property: the lists' lengths, one a row, and their items, end to end."""
 
 

@@ -423,11 +423,20 @@ def test_an_array_that_is_no_depth_is_named(tmp_path: Path, content: Any) -> Non
         open_source(path)
 
 
-@pytest.mark.parametrize("content", [b"", b"P5 2 2 255\n1234", b"P5 640 480 65535\nshort", b"P5"])
-def test_a_damaged_pgm_is_named(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "empty"),
+        (b"P5 2 2 255\n1234", "an 8-bit grey PPM"),
+        (b"P5 640 480 65535\nshort", "damaged or cut off"),
+        (b"P5", "cut off"),
+        (b"P7 2 2", "not a TIFF or PPM file"),
+    ],
+)
+def test_a_damaged_pgm_is_named(tmp_path: Path, content: bytes, says: str) -> None:
     (tmp_path / "0.pgm").write_bytes(content)
-    with pytest.raises(DamagedRecordingError, match=r"0\.pgm' is damaged or cut off"):
-        open_source(tmp_path)
+    with pytest.raises(DamagedRecordingError, match=rf"0\.pgm' is {says}"), open_source(tmp_path) as folder:
+        folder.read()
 
 
 # The folders that went wrong
