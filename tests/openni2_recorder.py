@@ -38,10 +38,10 @@ def main(library: str, out: str, frames: int, width: int, height: int) -> None:
     live.start()
     seen = 0
     while seen < frames:
-        frame = worker.next_frame(live.streams)
-        if frame is not None:
+        stream = openni2.wait_for_any_stream(live.streams, worker.WAIT_S)
+        if stream is not None:
             seen += 1
-            frame[0].close()
+            stream.read_frame().close()
     live.stream.stop()
     recorder.stop()
     recorder.close()

@@ -29,6 +29,7 @@ from selective_depth.drivers.source import DepthSource
 
 _OPEN_S = 10.0  # a sensor that loads its firmware takes seconds
 _REOPEN_S = 4.0  # when it comes back; longer if it took longer the first time
+_FIRST_FRAME_S = 10.0  # silence that a sensor is allowed before its first frame
 _STALL_S = 1.0  # silence after which the sensor counts as stalled
 _RESTART_S = 3.0  # silence after which it is opened afresh
 _HANG_S = 2.0  # the worker says something every 0.2 s; beyond this it hangs
@@ -63,8 +64,6 @@ class DeviceSettings:
         registered in any case if it can be.
     colour : bool, default True
         Deliver colour beside depth, where the sensor has it.
-    first_frame_s : float, default 10
-        How long a sensor may take for its first frame; later on it is opened afresh after 3 s.
     """
 
     width: int = 640
@@ -73,7 +72,6 @@ class DeviceSettings:
     mirror: bool = False
     nearest: bool = False
     registration: bool = False
-    first_frame_s: float = 10.0
     colour: bool = True
 
 
@@ -184,7 +182,7 @@ class OpenNIDevice(DepthSource):
             camera = replace(camera, cx=camera.width - 1 - camera.cx)
         self.camera = camera
         self.fps = float(about["fps"])
-        self._tenths = bool(about["tenths"])
+        self._tenths = about["form"] == "0.1 mm"
         self._colour: Message | None = about["colour"]
         if self._colour is not None:
             with suppress(ValueError):
@@ -260,12 +258,11 @@ class OpenNIDevice(DepthSource):
         return SourceTimeoutError(f"The sensor {self.uri} gave no frame within {timeout_s:g} s.{advice}")
 
     def _doubt_identity(self, about: Message) -> None:
-        note = (
-            f"{self.uri}: there are several of its kind and its driver gives no serial number; once"
-            " one is plugged in again, it cannot be known which it is."
-        )
-        if about["twins"] and not self.device.serial and note not in self.notes:
-            self.notes += (note,)
+        if about["twins"] and not self.device.serial:
+            self._note_once(
+                "there are several of its kind and its driver gives no serial number; once one is"
+                " plugged in again, it cannot be known which it is"
+            )
 
     def _become(self, state: str, why: str = "") -> None:
         with self._changed:
@@ -321,57 +318,54 @@ class OpenNIDevice(DepthSource):
     def _follow(self) -> tuple[str, str]:
         """Take frames in until something is wrong; return the new state and the reason."""
         misfits = unheard = 0
-        silence_s = max(self.settings.first_frame_s, _RESTART_S)
+        silence_s = _FIRST_FRAME_S
         while not self._closing.is_set():
             message = self._worker.receive(_PAIR_S if self._pairing.waits else _BEAT_S)
-            if message is None:  # else colour may be what comes now
-                self._hand_on(self._pairing.late())
             # Beats, not the clock: if this process was held up, it is not the worker's fault.
             unheard = unheard + 1 if message is None and not self._pairing.waits else 0
             if message is None:
+                self._hand_on(self._pairing.late())
                 if unheard * _BEAT_S > _HANG_S:
                     self._worker.close()  # at once: it would not stop the sensor any more
                     return "reconnecting", "OpenNI2 hangs"
-            elif message["kind"] == "frame":
-                misfits, silence_s = 0, _RESTART_S
-                self._arrive(message)
-            elif message["kind"] == "colour":
-                self._colour_arrives(message)
-            elif message["kind"] == "odd_colour":
-                self._note_once(f"its colour is left out: {message['problem']}")
-            elif message["kind"] == "misfit":
-                misfits += 1
-                self.misfits += 1
-                if misfits >= _MISFITS:
-                    why = f"{misfits} wrong frames in a row; the last: {message['problem']}"
-                    return "reconnecting", why
-            elif message["kind"] == "idle":
-                if message["silent_s"] > silence_s:
+                continue
+            match message["kind"]:
+                case "frame":
+                    misfits, silence_s = 0, _RESTART_S
+                    self._arrive(message)
+                case "colour":
+                    self._colour_arrives(message)
+                case "odd_colour":
+                    self._note_once(f"its colour is left out: {message['problem']}")
+                case "misfit":
+                    misfits += 1
+                    self.misfits += 1
+                    if misfits >= _MISFITS:
+                        return "reconnecting", f"{misfits} wrong frames in a row; the last: {message['problem']}"
+                case "idle" if message["silent_s"] > silence_s:
                     if self._first is None:
                         raise DeviceRefusedError(
                             f"The sensor {self.uri} opens, but sent no frame for {silence_s:g} s." + _NO_FRAMES
                         )
                     return "reconnecting", f"no frame for {silence_s:g} s"
-                if message["silent_s"] > _STALL_S:
+                case "idle" if message["silent_s"] > _STALL_S:
                     self._become("stalled", "it sends no frames")
-            elif message["kind"] == "lost":
-                return "lost", "it was unplugged or lost its power"
-            elif message["kind"] == "died":
-                return "reconnecting", message["reason"]
-            elif message["kind"] == "error":
-                return "reconnecting", message["message"].rstrip(".")
+                case "lost":
+                    return "lost", "it was unplugged or lost its power"
+                case "died":
+                    return "reconnecting", message["reason"]
+                case "error":
+                    return "reconnecting", message["message"].rstrip(".")
         return "lost", "closed"
 
     def _arrive(self, message: Message) -> None:
         stored = self._worker.take(message, self.camera.width, self.camera.height)
         depth_mm = upright(stored, self._tenths, self.settings.mirror)
         depth_mm.flags.writeable = False  # handed over: the frame need not copy it
-        said = self._count.mended
         number, timestamp_us = self._count.follow(message)
-        if self._count.mended > said == 0:
-            self.notes += (
-                f"{self.uri}: its clock stands, jumps back or does not count microseconds; this"
-                " computer's tells the times instead.",
+        if self._count.mended:
+            self._note_once(
+                "its clock stands, jumps back or does not count microseconds; this computer's tells the times instead"
             )
         frame = DepthFrame(depth_mm, number, timestamp_us, self.camera, self.uri)
         self._attempts = 0

@@ -25,7 +25,7 @@ class JobError(Exception):
     A `remedy` is what to do unless the USB bus, where the parent looks, tells more.
     """
 
-    def __init__(self, kind: str, message: str, remedy: str = "") -> None:
+    def __init__(self, message: str, *, kind: str = "DeviceRefusedError", remedy: str = "") -> None:
         super().__init__(message)
         self.kind = kind
         self.remedy = remedy

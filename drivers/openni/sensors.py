@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from selective_depth.drivers.errors import RuntimeMissingError
-from selective_depth.drivers.openni.process import Message, Worker, error_of
+from selective_depth.drivers.openni.process import Worker, error_of
 
 _LIST_S = 8.0  # drivers search the USB bus when they are loaded
 
@@ -47,22 +47,6 @@ def list_devices() -> list[DeviceInfo]:
 
 def survey() -> tuple[list[DeviceInfo], str]:
     """As `list_devices`, with the version of the runtime; asked at once, none of them is opened."""
-    answer = _ask()
-    return [DeviceInfo(**device) for device in answer["devices"]], str(answer["version"])
-
-
-def runtime_version() -> str:
-    """The version of the installed OpenNI2 runtime, such as ``2.2.0.33``.
-
-    Raises
-    ------
-    RuntimeMissingError
-        If OpenNI2 is not installed or does not start.
-    """
-    return survey()[1]
-
-
-def _ask() -> Message:
     worker = Worker("list")
     try:
         answer = worker.receive(_LIST_S)
@@ -76,4 +60,15 @@ def _ask() -> Message:
             f"OpenNI2 could not list its sensors: {happened}. One of its drivers may be broken:"
             " look at the folder OpenNI2/Drivers beside the runtime."
         )
-    return answer
+    return [DeviceInfo(**device) for device in answer["devices"]], str(answer["version"])
+
+
+def runtime_version() -> str:
+    """The version of the installed OpenNI2 runtime, such as ``2.2.0.33``.
+
+    Raises
+    ------
+    RuntimeMissingError
+        If OpenNI2 is not installed or does not start.
+    """
+    return survey()[1]

@@ -14,7 +14,8 @@ import signal
 import sys
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,9 +32,11 @@ else:  # a script finds what lies beside it only if told; last, to stand in noth
 WAIT_S = 0.2  # longest uninterrupted wait for a frame, and the beat of "idle" messages
 SETTLE_S = 0.05  # between stop and close: the runtime's threads set their flags late
 MILLIMETRES = int(openni2.PIXEL_FORMAT_DEPTH_1_MM)
-UNITS = {MILLIMETRES: "mm", 101: "0.1 mm"}
+DEPTHS = {MILLIMETRES: ("mm", 2), 101: ("0.1 mm", 2)}
 COLOURS = {200: ("RGB888", 3), 201: ("YUV422", 2), 205: ("YUYV", 2), 202: ("GRAY8", 1)}
-"""Pixel formats of colour streams, the best first, with their bytes a pixel."""
+"""Pixel formats that are read, the best first, with their bytes a pixel."""
+FORMS = DEPTHS | COLOURS
+NOT_FOUND = "SourceNotFoundError"
 
 
 class Device(openni2.Device):  # type: ignore[misc]
@@ -60,9 +63,9 @@ def initialize(job: dict[str, Any]) -> None:
         c_api.oniInitialize(c_api.ONI_API_VERSION)
     except (OpenNIError, OSError) as error:
         raise JobError(
-            "RuntimeMissingError",
             f"The OpenNI2 runtime {job['library']} cannot be started: {reason(error)}."
             " Install it again, or set OPENNI2_REDIST to another one's folder.",
+            kind="RuntimeMissingError",
         ) from error
     finally:
         os.chdir(before)
@@ -79,6 +82,15 @@ def reason(error: Exception) -> str:
         return words.rstrip(".")
     code = getattr(error, "code", None)
     return f"OpenNI2 gives no reason (status {int(code) if code is not None else '?'})"
+
+
+@contextmanager
+def refusing(what: str, advice: str = "", remedy: str = "") -> Iterator[None]:
+    """End the job where the runtime refuses something; `remedy` as of `JobError`."""
+    try:
+        yield
+    except OpenNIError as error:
+        raise JobError(f"{what}: {reason(error)}.{advice}", remedy=remedy) from error
 
 
 def devices() -> list[dict[str, Any]]:
@@ -117,17 +129,16 @@ def choose(found: list[dict[str, Any]], wanted: str, like: dict[str, Any] | None
         found, wanted = [*named, *others], ""
     uris = ", ".join(device["uri"] for device in found) or "none"
     if wanted:
-        raise JobError("SourceNotFoundError", f"There is no sensor '{wanted}'. Connected: {uris}.")
+        raise JobError(f"There is no sensor '{wanted}'. Connected: {uris}.", kind=NOT_FOUND)
     if not found:
-        raise JobError(
-            "SourceNotFoundError", "OpenNI2 finds no depth sensor.", "Plug one in; a Kinect needs its power supply too."
-        )
+        advice = "Plug one in; a Kinect needs its power supply too."
+        raise JobError("OpenNI2 finds no depth sensor.", kind=NOT_FOUND, remedy=advice)
     # Of several of a kind a serial number tells the right one; without, only its own address.
     if len(found) > 1 and not (like and (like["serial"] or named)):
         raise JobError(
-            "SourceNotFoundError",
             f"{len(found)} sensors are connected: {uris}. Name one of them, as in"
             f" `selective-depth live {shlex.quote(found[0]['uri'])}`.",
+            kind=NOT_FOUND,
         )
     return found if like and like["serial"] else found[:1]
 
@@ -146,8 +157,22 @@ def _distance(mode: tuple[int, ...], wanted: tuple[int, ...]) -> tuple[float, ..
 def mode_text(mode: Any) -> str:
     """A video mode for people; the library's own `repr` raises."""
     width, height, fps, pixels = mode_key(mode)
-    unit = UNITS.get(pixels, f"pixel format {pixels}")
-    return f"{width}x{height} at {fps} fps in {unit}"
+    form, _ = FORMS.get(pixels, (f"pixel format {pixels}", 0))
+    return f"{width}x{height} at {fps} fps in {form}"
+
+
+def set_up(stream: Any, mode: Any) -> None:
+    """Take a mode, whole images and no mirroring, but set only what differs: drivers refuse the odd setting."""
+    # What a driver does not tell of, or fails to tell, is left as it is.
+    with suppress(OpenNIError):
+        if stream.is_cropping_supported() and stream.get_cropping().enabled:
+            stream.reset_cropping()
+    if mode_key(stream.get_video_mode()) != mode_key(mode):
+        stream.set_video_mode(mode)
+    with suppress(OpenNIError):
+        if stream.is_property_supported(c_api.ONI_STREAM_PROPERTY_MIRRORING) and stream.get_mirroring_enabled():
+            # Mirroring, where wanted, is the parent's: libfreenect's writes out of bounds.
+            stream.set_mirroring_enabled(False)
 
 
 class Watch(openni2.DeviceListener):  # type: ignore[misc]
@@ -180,27 +205,28 @@ class LiveStream:
             self.device.close()
         else:
             raise JobError(
-                "SourceNotFoundError", f"Of the sensors that are there, none has the serial number {like['serial']}."
+                f"Of the sensors that are there, none has the serial number {like['serial']}.", kind=NOT_FOUND
             )
         kind = info["vendor"], info["name"]
         same = [each["uri"] for each in there if (each["vendor"], each["name"]) == kind]
         self.twins = len({address.partition("?")[0] for address in same}) > 1
-        uri = info["uri"]
         self.colour: Any = None
         self.colour_trouble = ""
         self.registered = False
+        self.sensor = f"The sensor {info['uri']}"
         if not self.device.has_sensor(openni2.SENSOR_DEPTH):
-            raise JobError("DeviceRefusedError", f"The sensor {uri} has no depth camera.")
-        try:
+            raise JobError(f"{self.sensor} has no depth camera.")
+        with refusing(f"{self.sensor} refuses a depth stream", " Pull it out and plug it in again."):
             self.stream = self.device.create_depth_stream()
             self._configure(job["settings"])
-        except OpenNIError as error:
-            raise JobError(
-                "DeviceRefusedError",
-                f"The sensor {uri} refuses a depth stream: {reason(error)}. Pull it out and plug it in again.",
-            ) from error
         if job["settings"]["colour"]:
             self._open_colour()
+
+    def _open(self) -> None:
+        uri = self.info["uri"]
+        remedy = "Close the program that uses it, or pull it out and plug it in again."
+        with refusing(f"The sensor {uri} is there but cannot be opened", remedy=remedy):
+            self.device = Device(uri.encode())
 
     def _open_colour(self) -> None:
         """Add the colour stream, where there is one that can be read; depth needs none."""
@@ -213,32 +239,16 @@ class LiveStream:
             order = list(COLOURS)
             known = [mode for mode in modes if mode_key(mode)[3] in order]
             if not known:
-                self.colour_trouble = (
-                    f"its colour is in none of the forms that are read: {'; '.join(map(mode_text, modes))}"
-                )
+                offered = "; ".join(map(mode_text, modes))
+                self.colour_trouble = f"its colour is in none of the formats that are read: {offered}"
                 return
             mode = min(known, key=lambda m: (_distance(mode_key(m), depth)[0], order.index(mode_key(m)[3]), -m.fps))
             stream = self.device.create_color_stream()
-            if mode_key(stream.get_video_mode()) != mode_key(mode):
-                stream.set_video_mode(mode)
-            with suppress(OpenNIError):
-                if stream.is_property_supported(c_api.ONI_STREAM_PROPERTY_MIRRORING) and stream.get_mirroring_enabled():
-                    stream.set_mirroring_enabled(False)
-            self._register(True, needed=False)
+            set_up(stream, mode)
+            self._register(True)
             self.colour = stream
         except OpenNIError as error:
             self.colour_trouble = f"its colour stream is refused: {reason(error)}"
-
-    def _open(self) -> None:
-        uri = self.info["uri"]
-        try:
-            self.device = Device(uri.encode())
-        except OpenNIError as error:
-            raise JobError(
-                "DeviceRefusedError",
-                f"The sensor {uri} is there but cannot be opened: {reason(error)}.",
-                "Close the program that uses it, or pull it out and plug it in again.",
-            ) from error
 
     def _serial(self) -> str:
         """Its serial number; empty where the driver does not give it."""
@@ -250,34 +260,22 @@ class LiveStream:
         return ""
 
     def _configure(self, settings: dict[str, Any]) -> None:
-        """Set what is not yet as wanted, and nothing else: drivers refuse the odd setting."""
-        stream = self.stream
-        uri = self.info["uri"]
         wanted = (settings["width"], settings["height"], settings["fps"], MILLIMETRES)
         modes = list(self.device.get_sensor_info(openni2.SENSOR_DEPTH).videoModes)
-        usable = [mode for mode in modes if mode_key(mode)[3] in UNITS]
-        usable.sort(key=lambda mode: _distance(mode_key(mode), wanted))
-        mode = usable[0] if usable else None
+        usable = [mode for mode in modes if mode_key(mode)[3] in DEPTHS]
+        mode = min(usable, key=lambda each: _distance(mode_key(each), wanted), default=None)
         if mode is None or not (settings["nearest"] or mode_key(mode)[:3] == wanted[:3]):
             raise JobError(
-                "DeviceRefusedError",
-                f"The sensor {uri} cannot give {wanted[0]}x{wanted[1]} at {wanted[2]} fps in mm."
-                f" It offers: {'; '.join(map(mode_text, modes))}.",
+                f"{self.sensor} cannot give {wanted[0]}x{wanted[1]} at {wanted[2]} fps in mm."
+                f" It offers: {'; '.join(map(mode_text, modes))}."
             )
-        # What a driver does not tell of, or fails to tell, is left as it is.
-        with suppress(OpenNIError):
-            if stream.is_cropping_supported() and stream.get_cropping().enabled:
-                stream.reset_cropping()
-        if mode_key(stream.get_video_mode()) != mode_key(mode):
-            stream.set_video_mode(mode)
-        with suppress(OpenNIError):
-            mirrored = stream.is_property_supported(c_api.ONI_STREAM_PROPERTY_MIRRORING)
-            if mirrored and stream.get_mirroring_enabled():
-                # Mirroring, where wanted, is the parent's: libfreenect's writes out of bounds.
-                stream.set_mirroring_enabled(False)
+        set_up(self.stream, mode)
         self._register(settings["registration"])
+        if settings["registration"] and not self.registered:
+            raise JobError(f"{self.sensor} cannot register depth to its colour camera.")
 
-    def _register(self, wanted: bool, needed: bool = True) -> None:
+    def _register(self, wanted: bool) -> None:
+        """Have depth registered to colour, or not, where the sensor can."""
         device = self.device
         mode = openni2.IMAGE_REGISTRATION_DEPTH_TO_COLOR if wanted else openni2.IMAGE_REGISTRATION_OFF
         known = False
@@ -288,21 +286,12 @@ class LiveStream:
             if known and device.get_image_registration_mode() != mode:
                 device.set_image_registration_mode(mode)
         self.registered = wanted and known
-        if wanted and needed and not known:
-            raise JobError(
-                "DeviceRefusedError", f"The sensor {self.info['uri']} cannot register depth to its colour camera."
-            )
 
     def start(self) -> None:
         """Let the frames come."""
-        try:
+        advice = " Check its power supply, pull it out and plug it in again."
+        with refusing(f"{self.sensor} does not start", advice):
             self.stream.start()
-        except OpenNIError as error:
-            raise JobError(
-                "DeviceRefusedError",
-                f"The sensor {self.info['uri']} does not start: {reason(error)}. Check its power"
-                " supply, pull it out and plug it in again.",
-            ) from error
         try:
             if self.colour is not None:
                 self.colour.start()
@@ -332,9 +321,11 @@ def describe(stream: Any) -> dict[str, Any]:
         fov_rad = stream.get_horizontal_fov(), stream.get_vertical_fov()
     except OpenNIError:
         fov_rad = (0.0, 0.0)  # not every driver knows it
+    # Frames in any other format than a depth that is read are misfits.
+    form, pixel_bytes = FORMS.get(int(mode.pixelFormat), FORMS[MILLIMETRES])
     return {
-        "tenths": int(mode.pixelFormat) == 101,
-        "form": COLOURS.get(int(mode.pixelFormat), ("", 2))[0],
+        "form": form,
+        "pixel_bytes": pixel_bytes,
         "width": mode.resolutionX,
         "height": mode.resolutionY,
         "fps": mode.fps,
@@ -343,26 +334,17 @@ def describe(stream: Any) -> dict[str, Any]:
     }
 
 
-def next_frame(streams: list[Any]) -> tuple[Any, Any] | None:
-    """The next frame, to be closed by the caller, and its stream; None if none comes for a while."""
-    stream = openni2.wait_for_any_stream(streams, WAIT_S)
-    return None if stream is None else (stream.read_frame(), stream)
-
-
 def misfit(frame: Any, about: dict[str, Any]) -> str:
     """What is wrong with a frame's size or format; empty if nothing. Rows may be padded."""
-    width, height, kind = about["width"], about["height"], int(frame.videoMode.pixelFormat)
-    row = width * COLOURS.get(kind, ("", 2))[1]
-    least = (height - 1) * frame.stride + row
-    fits = frame.stride >= row and frame.dataSize >= least
+    width, height, row = about["width"], about["height"], about["width"] * about["pixel_bytes"]
+    fits = frame.stride >= row and frame.dataSize >= (height - 1) * frame.stride + row
     if (frame.width, frame.height) != (width, height) or not fits:
         got = (frame.width, frame.height, frame.stride, frame.dataSize)
         return "it is {}x{} (stride {}, {} bytes), expected {}x{} (stride {}, {} bytes)".format(
             *got, width, height, row, row * height
         )
-    wanted = (101 if about["tenths"] else MILLIMETRES) if not about["form"] else kind
-    if kind != wanted or COLOURS.get(kind, ("", 2))[0] != about["form"]:
-        return f"it is {mode_text(frame.videoMode)}, expected {about['kind'] or 'depth in mm'}"
+    if FORMS.get(int(frame.videoMode.pixelFormat)) != (about["form"], about["pixel_bytes"]):
+        return f"it is {mode_text(frame.videoMode)}, expected {about['form']}"
     return ""
 
 
@@ -382,37 +364,39 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
     live = LiveStream(job, parent)
     live.start()
     about = [describe(stream) for stream in live.streams]
-    colour = dict(enumerate(about)).get(1)
+    depth, colour = about[0], about[1] if len(about) > 1 else None
     told = {"colour": colour, "colour_trouble": live.colour_trouble, "registered": live.registered}
-    parent.send("opened", device=live.info, twins=live.twins, **about[0], **told)
-    width, height = about[0]["width"], about[0]["height"]
-    if not slots.fits(width * height * 2):
-        raise JobError("DeviceRefusedError", f"Frames of {width}x{height} pixels are too large.")
-    last_frame = time.monotonic()
+    parent.send("opened", device=live.info, twins=live.twins, **depth, **told)
+    if not slots.fits(depth["width"] * depth["height"] * depth["pixel_bytes"]):
+        raise JobError(f"Frames of {depth['width']}x{depth['height']} pixels are too large.")
+    last_depth = time.monotonic()
     while not parent.stop.is_set():
         if live.watch.lost.is_set():
             parent.send("lost")
             break
-        found = next_frame(live.streams)
-        frame, is_depth = (None, True) if found is None else (found[0], found[1] is live.stream)
+        stream = openni2.wait_for_any_stream(live.streams, WAIT_S)
+        frame = None if stream is None else stream.read_frame()
+        filled = frame is not None and frame.dataSize > 0  # a transfer may carry nothing
         now = time.monotonic()
-        if is_depth and frame is not None and frame.dataSize > 0:
-            last_frame = now
-        elif frame is None or is_depth or now - last_frame > WAIT_S:  # a transfer that carried nothing, or only colour
-            parent.send("idle", silent_s=now - last_frame)
+        if filled and stream is live.stream:
+            last_depth = now
+        elif not filled or now - last_depth > WAIT_S:
+            parent.send("idle", silent_s=now - last_depth)
+        if filled and stream is live.stream:
+            deliver(frame, depth, slots, parent, "frame", "misfit")
+        elif filled:
+            deliver(frame, colour, slots, parent, "colour", "odd_colour")
         if frame is not None:
-            if frame.dataSize > 0:
-                deliver(frame, about[0 if is_depth else 1], slots, parent, "frame" if is_depth else "colour")
             frame.close()
     live.close()
 
 
-def deliver(frame: Any, about: dict[str, Any], slots: Slots, parent: Parent, what: str) -> None:
-    """Put a frame into shared memory and say so; a colour image that does not fit is left out."""
+def deliver(frame: Any, about: Any, slots: Slots, parent: Parent, what: str, wrong: str) -> None:
+    """Put an image into shared memory and say `what` it is; say it is `wrong` where it does not fit."""
     problem = misfit(frame, about)
-    row = about["width"] * COLOURS.get(int(frame.videoMode.pixelFormat), ("", 2))[1]
+    row = about["width"] * about["pixel_bytes"]
     if problem or not slots.fits(row * about["height"]):
-        parent.send("misfit" if what == "frame" else "odd_colour", problem=problem or "it is too large")
+        parent.send(wrong, problem=problem or "it is too large")
         return
     slot = slots.take()
     if slot is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from selective_depth.drivers.frame import DepthArray
 from selective_depth.drivers.openni import OpenNIDevice
 from selective_depth.drivers.openni import device as openni_device
+from selective_depth.drivers.openni import worker
 from selective_depth.drivers.openni.process import Message
 
 FOUND: Message = {"kind": "found"}
@@ -25,7 +27,7 @@ OPENED: Message = {
         "serial": "1",
     },
     "twins": False,
-    "tenths": False,
+    "form": "mm",
     "width": 8,
     "height": 6,
     "fps": 30,
@@ -125,3 +127,21 @@ def test_a_lost_sensor_that_is_there_again_is_reconnecting(play: Callable[..., O
     with device:
         wait_until(lambda: len(seen) == 3)
     assert seen == [("lost", "it was unplugged or lost its power"), ("reconnecting", "it is there again"), ("live", "")]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({}, ""),
+        ({"stride": 20, "dataSize": 116}, ""),
+        ({"height": 3}, r"it is 8x3 (stride 16, 96 bytes), expected 8x6 (stride 16, 96 bytes)"),
+        ({"dataSize": 95}, "95 bytes"),
+        ({"pixelFormat": 101}, "it is 8x6 at 30 fps in 0.1 mm, expected mm"),
+        ({"pixelFormat": 102}, "it is 8x6 at 30 fps in pixel format 102, expected mm"),
+    ],
+)
+def test_what_is_wrong_with_a_frame_is_told(change: dict[str, int], says: str) -> None:
+    mode = SimpleNamespace(resolutionX=8, resolutionY=6, fps=30, pixelFormat=change.pop("pixelFormat", 100))
+    frame = SimpleNamespace(**{"width": 8, "height": 6, "stride": 16, "dataSize": 96} | change, videoMode=mode)
+    problem = worker.misfit(frame, {"width": 8, "height": 6, "form": "mm", "pixel_bytes": 2})
+    assert says in problem and bool(says) == bool(problem)

@@ -17,7 +17,7 @@ from selective_depth.drivers.errors import DeviceLostError, DeviceRefusedError, 
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.drivers.oni import write_oni
 from selective_depth.drivers.open import open_source
-from selective_depth.drivers.openni import DeviceSettings, OpenNIDevice, record
+from selective_depth.drivers.openni import OpenNIDevice, record
 from selective_depth.drivers.openni.runtime import Runtime
 from selective_depth.drivers.openni.usb import usb_advice
 
@@ -49,11 +49,13 @@ def test_a_first_frame_that_takes_four_seconds(virtual_sensor: VirtualSensor) ->
 
 
 @pytest.mark.parametrize("vice", [{"empty": 1}, {"stall": 1}])
-def test_no_frame_at_all_ends_with_advice(virtual_sensor: VirtualSensor, vice: dict[str, int]) -> None:
+def test_no_frame_at_all_ends_with_advice(
+    virtual_sensor: VirtualSensor, vice: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     virtual_sensor.set(**vice)
-    settings = DeviceSettings(first_frame_s=3.0)
+    monkeypatch.setattr("selective_depth.drivers.openni.device._FIRST_FRAME_S", 3.0)
     with (
-        OpenNIDevice(settings=settings) as device,
+        OpenNIDevice() as device,
         pytest.raises(DeviceRefusedError, match=r"sent no frame for 3 s.*hub.*power.*virtual"),
     ):
         device.read(timeout_s=8.0)
