@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from selective_depth.drivers.frame import DepthArray
-from selective_depth.drivers.openni import OpenNIDevice
+from selective_depth.drivers.openni import OpenNIDevice, worker
 from selective_depth.drivers.openni import device as openni_device
-from selective_depth.drivers.openni import worker
 from selective_depth.drivers.openni.process import Message
 
 FOUND: Message = {"kind": "found"}
