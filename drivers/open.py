@@ -40,8 +40,7 @@ def open_source(uri: str | Path) -> DepthSource:
     if scheme.partition("?")[0] == "openni":
         from selective_depth.drivers.openni import OpenNIDevice, parse_address
 
-        address, settings, intrinsics, colouring = parse_address(name[6:].removeprefix(":"))
-        return OpenNIDevice(address, settings, intrinsics=intrinsics, colouring=colouring)
+        return OpenNIDevice(*parse_address(name[6:].removeprefix(":")))
     if scheme == "virtual":
         from selective_depth.drivers.virtual import VirtualSource
 

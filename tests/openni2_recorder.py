@@ -25,7 +25,8 @@ class Parent:
 
 def main(library: str, out: str, frames: int, width: int, height: int) -> None:
     worker.initialize({"library": library})
-    settings = {"width": width, "height": height, "fps": 30, "registration": False, "nearest": False, "colour": False}
+    settings = {"width": width, "height": height, "fps": 30, "registration": False, "nearest": False}
+    settings["colouring"] = {"wanted": False}
     live = worker.LiveStream({"uri": "", "like": None, "settings": settings}, Parent())
     recorder = openni2.Recorder(out.encode())
     recorder.attach(live.stream, False)

@@ -41,7 +41,7 @@ _NO_FRAMES = (
 )
 _GRACE_S = 1.0  # for a worker to stop the sensor before it is killed
 _PAIR_S = 0.01  # how soon a frame that waits for its colour is handed on without
-_COLOUR_KEYS = (("width", "height"), ("fov_x_rad", "fov_y_rad"))
+_FIELD_OF_VIEW = ("width", "height", "fov_x_rad", "fov_y_rad")
 _BEAT_S = 0.1  # how soon the supervisor notices that it should end
 
 
@@ -62,8 +62,10 @@ class DeviceSettings:
     registration : bool, default False
         Depth registered to the sensor's colour camera, or refused; where there is colour it is
         registered in any case if it can be.
-    colour : bool, default True
-        Deliver colour beside depth, where the sensor has it.
+    intrinsics : (float, float, float, float), optional
+        fx, fy, cx, cy in pixels; default from the field of view that the driver states.
+    colouring : Colouring, optional
+        What is known of its colour; default what the driver states.
     """
 
     width: int = 640
@@ -72,11 +74,12 @@ class DeviceSettings:
     mirror: bool = False
     nearest: bool = False
     registration: bool = False
-    colour: bool = True
+    intrinsics: tuple[float, ...] | None = None
+    colouring: Colouring = ON
 
 
-def parse_address(text: str) -> tuple[str, DeviceSettings, tuple[float, ...] | None, Colouring]:
-    """What a sensor's name with options says, ``ADDRESS?mode=640x480@30``: address, settings, intrinsics, colour.
+def parse_address(text: str) -> tuple[str, DeviceSettings]:
+    """What a sensor's name with options says, ``ADDRESS?mode=640x480@30``: its address and settings.
 
     Raises
     ------
@@ -86,11 +89,12 @@ def parse_address(text: str) -> tuple[str, DeviceSettings, tuple[float, ...] | N
     # An address may have a '?' of its own.
     address, query = [*re.split(r"\?(?=(?:mode|camera|scale|topic|stream|colour)=)", text, maxsplit=1), ""][:2]
     options = Options(query, f"the sensor '{address}'")
-    mode = [int(each) for each in options.numbers("mode", "WIDTHxHEIGHT@FPS", 1, 1e5, r"x|@") or ()]
+    mode = options.numbers("mode", "WIDTHxHEIGHT@FPS", 1, 1e5, r"x|@")
+    width, height, fps = map(int, mode or (640, 480, 30))
     intrinsics, colouring = options.camera(), Colouring.of(options)
+    settings = DeviceSettings(width, height, fps, nearest=mode is None, intrinsics=intrinsics, colouring=colouring)
     options.done()
-    settings = DeviceSettings(mode[0], mode[1], mode[2]) if mode else DeviceSettings(nearest=True)
-    return address, replace(settings, colour=colouring.wanted), intrinsics, colouring
+    return address, settings
 
 
 class OpenNIDevice(DepthSource):
@@ -116,10 +120,6 @@ class OpenNIDevice(DepthSource):
         Default 640x480 at 30 fps, not mirrored, not registered.
     tap : callable, optional
         Its `tap` from the first frame on.
-    intrinsics : (float, float, float, float), optional
-        fx, fy, cx, cy in pixels; default from the field of view that the driver states.
-    colouring : Colouring, optional
-        What is known of its colour; default what the driver states.
 
     Attributes
     ----------
@@ -154,8 +154,6 @@ class OpenNIDevice(DepthSource):
         settings: DeviceSettings | None = None,
         *,
         tap: Callable[[DepthFrame], None] | None = None,
-        intrinsics: tuple[float, ...] | None = None,
-        colouring: Colouring = ON,
     ) -> None:
         self.uri = f"openni:{device_uri}" if device_uri else "openni"
         self.settings = settings or DeviceSettings(nearest=True)
@@ -177,17 +175,17 @@ class OpenNIDevice(DepthSource):
         started = time.monotonic()
         self._worker, about = self._open(_OPEN_S, None)
         self._reopen_s = max(_REOPEN_S, 2 * (time.monotonic() - started))
-        camera, notes = camera_of(about, intrinsics)
+        camera, notes = camera_of(about, self.settings.intrinsics)
         if self.settings.mirror:
             camera = replace(camera, cx=camera.width - 1 - camera.cx)
         self.camera = camera
         self.fps = float(about["fps"])
         self._tenths = about["form"] == "0.1 mm"
         self._colour: Message | None = about["colour"]
+        colouring = self.settings.colouring
         if self._colour is not None:
             with suppress(ValueError):
-                size, angles = ((self._colour[name] for name in names) for names in _COLOUR_KEYS)
-                seen = Camera.from_fov(*size, *angles)
+                seen = Camera.from_fov(*(self._colour[key] for key in _FIELD_OF_VIEW))
                 colouring = colouring.told_by((seen.fx, seen.fy, seen.cx, seen.cy), None)
         self._pairing = Pairing(self._colour is not None, bool(about["registered"]), colouring)
         wanted = (self.settings.width, self.settings.height, self.settings.fps)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni import OniRecorder
-from selective_depth.drivers.openni.device import DeviceSettings, OpenNIDevice, parse_address
+from selective_depth.drivers.openni.device import OpenNIDevice, parse_address
 
 _BEAT_S = 0.1  # how often it is looked whether it is over
 
@@ -45,7 +45,6 @@ def record(
     *,
     frames: int | None = None,
     duration_s: float | None = None,
-    settings: DeviceSettings | None = None,
     progress: Callable[[int], None] | None = None,
     overwrite: bool = False,
 ) -> RecordingReport:
@@ -65,8 +64,6 @@ def record(
         How many frames to record; default until stopped.
     duration_s : float, optional
         How long to record; default until stopped.
-    settings : DeviceSettings, optional
-        How to set the sensor up. What is recorded is what it delivers so.
     progress : callable, optional
         Called with the number of frames so far, some times a second.
     overwrite : bool, default False
@@ -79,7 +76,7 @@ def record(
     SourceNotFoundError, RuntimeMissingError, DeviceRefusedError
         As for `OpenNIDevice`.
     """
-    address, asked, intrinsics, colouring = parse_address(device_uri)
+    address, settings = parse_address(device_uri)
     recorder = OniRecorder(out_path, overwrite=overwrite)
     taken = made = 0
 
@@ -98,7 +95,7 @@ def record(
             progress(told)
 
     try:
-        with OpenNIDevice(address, settings or asked, tap=take, intrinsics=intrinsics, colouring=colouring) as device:
+        with OpenNIDevice(address, settings, tap=take) as device:
             started = time.monotonic()
             recorder.fps = device.fps
             try:

@@ -219,7 +219,7 @@ class LiveStream:
         with refusing(f"{self.sensor} refuses a depth stream", " Pull it out and plug it in again."):
             self.stream = self.device.create_depth_stream()
             self._configure(job["settings"])
-        if job["settings"]["colour"]:
+        if job["settings"]["colouring"]["wanted"]:
             self._open_colour()
 
     def _open(self) -> None:
