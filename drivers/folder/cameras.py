@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 from scipy.io import loadmat
 
 from selective_depth.drivers.errors import DamagedRecordingError
@@ -67,8 +68,8 @@ class CameraFile:
             return None
 
 
-def find_camera_file(root: Path) -> CameraFile | None:
-    """The first file of a known name beside the frames, read; None if there is none.
+def find_camera_file(root: Path) -> CameraFile:
+    """What the first file of a known name beside the frames says; nothing if there is none.
 
     Raises
     ------
@@ -77,7 +78,7 @@ def find_camera_file(root: Path) -> CameraFile | None:
     """
     path = next((path for name in _FILES for path in sorted(root.glob(name))), None)
     if path is None:
-        return None
+        return CameraFile(root)
     try:
         if path.suffix == ".mat":
             entries = loadmat(path)
@@ -95,7 +96,7 @@ def find_camera_file(root: Path) -> CameraFile | None:
         return CameraFile(path, _matrix(numbers))
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise DamagedRecordingError(
-            f"'{path}' holds no intrinsics in a form that is known ({error!s:.80}); put the"
+            f"'{path}' holds no intrinsics in a known form ({error!s:.80}); put the"
             " camera and the scale into frames.toml, and rename or remove this file."
         ) from error
 
@@ -105,10 +106,9 @@ def _matrix(numbers: Sequence[float], columns: bool = False) -> tuple[float, flo
     if len(numbers) == 4:
         fx, fy, cx, cy = map(float, numbers)
         return fx, fy, cx, cy
-    side = {9: 3, 12: 4, 16: 4}[len(numbers)]
-    at = (0, side + 1, 2 * side, 2 * side + 1) if columns else (0, side + 1, 2, side + 2)
-    fx, fy, cx, cy = (float(numbers[each]) for each in at)
-    return fx, fy, cx, cy
+    shape = {9: (3, 3), 12: (3, 4), 16: (4, 4)}[len(numbers)]
+    matrix = np.array(numbers, np.float64).reshape(shape, order="F" if columns else "C")
+    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
 
 
 def _from_json(path: Path, entries: dict[str, Any]) -> CameraFile:

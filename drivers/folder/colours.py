@@ -67,7 +67,7 @@ class Colours:
         self.about = f"; colour of {count} of {len(self._files)} frames from '{folder}'"
         if not (self._registered or self._colouring.registered or self._colouring.place_mm):
             self.notes = (
-                "its colour images are not said to lie on its depth images, so the cloud has not their colours;"
+                "nothing says that its colour images lie on its depth images, so the cloud is not coloured;"
                 " give --colour registered if they do, or the colour camera with --colour fx,fy,cx,cy,x,y,z.",
             )
 
@@ -78,7 +78,7 @@ class Colours:
             return frame, ""
         colour = rgb_of_file(path)
         if colour is None:
-            return frame, f"'{path}' is no colour image that can be read; its frame has none."
+            return frame, f"'{path}' cannot be read as a colour image; its frame has no colour."
         time_us = self._times_us[frame.index] if self._times_us else frame.timestamp_us
         return self._colouring.colour(frame, colour, time_us, self._registered), ""
 

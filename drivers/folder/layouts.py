@@ -2,14 +2,14 @@
 
 A row names its depth images by a pattern below the folder's root and the signs that tell it from
 others of that pattern; the first row that fits is taken. Scales, cameras and marks of a missing
-measurement are those that the publishers state; `assumed` marks what is only the custom. The table
+measurement are those that the publishers state; `assumed` marks what is merely usual. The table
 is in ``app/docs/recordings.md`` with the source of each.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from decimal import Decimal
 from fnmatch import fnmatch
@@ -26,6 +26,7 @@ from selective_depth.drivers.folder.sidecar import SIDECAR, read_text
 from selective_depth.drivers.frame import MOST_TIME_US, Camera
 
 _Values = npt.NDArray[np.float64]
+_Colour = tuple[tuple[int, Path] | None, ...]
 _DECIMAL: Final = r"[0-9]{1,30}\.[0-9]{1,30}"
 """A file name that is one number: a time, as a rule."""
 _EPOCH: Final = r"^([0-9]{9,11}\.[0-9]{1,9})$"
@@ -68,7 +69,7 @@ class Layout:
     marks : tuple of int
         Values that mean "no measurement", beside 0.
     assumed : bool
-        The scale is the custom, and nowhere stated.
+        The scale is the usual one, and stated nowhere.
     stamp : tuple of (str, float)
         Regular expression of the time in a file's name, and its unit in microseconds.
     convert : callable, optional
@@ -193,7 +194,7 @@ class Found:
     root: Path
     files: list[Path] = field(repr=False)
     timestamps_us: tuple[int, ...] | None = None
-    colour: tuple[tuple[int, Path] | None, ...] | None = None
+    colour: _Colour | None = None
 
 
 def find_layout(folder: Path) -> Found:
@@ -294,41 +295,36 @@ def doubtful_order(files: list[Path]) -> tuple[str, ...]:
     )
 
 
-def _read_list(
-    root: Path, index: Path
-) -> tuple[list[Path], tuple[int, ...], tuple[tuple[int, Path] | None, ...] | None]:
+def _read_list(root: Path, index: Path) -> tuple[list[Path], tuple[int, ...], _Colour | None]:
     """Depth images with their times, and the colour image of each, as a list of files has them.
 
     Colour is the other pair of an association; of ``depth.txt``, what ``rgb.txt`` has nearest in
     time. Colour images that are not there are no damage.
     """
     lines = _pairs(index)
-    # Of the two pairs of an association, depth is the one whose file lies in the depth folder.
-    depths = [next((pair for pair in pairs if pair[1].startswith("depth")), pairs[0]) for _, pairs in lines]
-    files, times_us = [root / name for _, name in depths], tuple(time_us for time_us, _ in depths)
-    for (number, _), file in zip(lines, files, strict=True):
-        if not file.exists():
+    for number, pairs in lines:
+        # Of the two pairs of an association, depth is the one whose file lies in the depth folder.
+        pairs.sort(key=lambda pair: not pair[1].startswith("depth"))
+        if not (file := root / pairs[0][1]).exists():
             raise DamagedRecordingError(
                 f"'{file}' is missing: line {number} of '{index}' names it. Copy it again, or remove that line."
             )
-    if not files:
+    if not lines:
         raise SourceNotFoundError(_nothing_found(root))
+    files, times_us = [root / pairs[0][1] for _, pairs in lines], tuple(pairs[0][0] for _, pairs in lines)
     if any(len(pairs) > 1 for _, pairs in lines):
-        others = [
-            next((pair for pair in pairs if pair != depth), None)
-            for (_, pairs), depth in zip(lines, depths, strict=True)
-        ]
-        return (
-            files,
-            times_us,
-            tuple((other[0], root / other[1]) if other and (root / other[1]).is_file() else None for other in others),
-        )
+        return files, times_us, tuple(next(_there(root, pairs[1:2]), None) for _, pairs in lines)
     if not (root / "rgb.txt").is_file():
         return files, times_us, None
-    there = sorted((time_us, root / name) for _, pairs in _pairs(root / "rgb.txt") for time_us, name in pairs)
-    there = [pair for pair in there if pair[1].is_file()]
-    near = [nearest([pair[0] for pair in there], time_us) for time_us in times_us]
-    return files, times_us, tuple(None if k is None else there[k] for k in near)
+    images = sorted(image for _, pairs in _pairs(root / "rgb.txt") for image in _there(root, pairs))
+    rising = [time_us for time_us, _ in images]
+    near = [nearest(rising, time_us) for time_us in times_us]
+    return files, times_us, tuple(None if k is None else images[k] for k in near)
+
+
+def _there(root: Path, pairs: list[tuple[int, str]]) -> Iterator[tuple[int, Path]]:
+    """Those of a list's files that are there."""
+    return ((time_us, root / name) for time_us, name in pairs if (root / name).is_file())
 
 
 def _pairs(index: Path) -> list[tuple[int, list[tuple[int, str]]]]:
@@ -352,7 +348,7 @@ def _pairs(index: Path) -> list[tuple[int, list[tuple[int, str]]]]:
             outside = inside.is_absolute() or ".." in inside.parts or "\\" in name or ":" in name
             if outside or "\0" in name or any(len(part) > 200 for part in inside.parts):
                 raise DamagedRecordingError(
-                    f"line {number} of '{index}' names '{name:.80}', which is no file's name or may lie outside of the"
+                    f"line {number} of '{index}' names '{name:.80}', which is not a file's name or may lie outside the"
                     " folder; name files inside it, as in depth/0001.png."
                 )
         lines.append((number, pairs))

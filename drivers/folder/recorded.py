@@ -28,7 +28,7 @@ from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame, millim
 from selective_depth.drivers.source import DepthSource
 
 _LOOKS: Final = 5
-"""Frames that are looked at before a scale that is only the custom is believed."""
+"""Frames that are looked at before a scale that is merely usual is believed."""
 _NEAREST_M, _NEAR_M = 0.4, 0.8
 """A twentieth of the pixels nearer than the first, or half nearer than the second: no room that a
 Kinect sees, but millimetres read at 5000 a metre."""
@@ -67,7 +67,7 @@ class RecordedFolder(DepthSource):
     SourceNotFoundError
         If there is no folder, or no depth frame in it.
     DamagedRecordingError
-        If a file is no depth image, the sizes differ, or the sidecar is wrong.
+        If a file is not a depth image, the sizes differ, or the sidecar is wrong.
     SourceError
         If the scale cannot be known.
     """
@@ -92,7 +92,7 @@ class RecordedFolder(DepthSource):
             sidecar, beside = read_sidecar(side), find_camera_file(self.found.root)
         else:
             self.found = Found(ARRAYS, path.parent, [path] * len(self._stack))
-            sidecar, beside = Sidecar(), None
+            sidecar, beside = Sidecar(), CameraFile(path)
         self.layout = self.found.row.name
         self._files = self.found.files
         self.notes = doubtful_order(self._files)
@@ -109,10 +109,12 @@ class RecordedFolder(DepthSource):
                 )
         self.fps = sidecar.fps or _fps_from(self._timestamps_us)
         marks = self.found.row.marks if sidecar.missing is None else sidecar.missing
-        said = values_per_metre or sidecar.values_per_metre
-        where = "as given" if values_per_metre else SIDECAR
-        if said is None and beside is not None and beside.values_per_metre is not None:
-            said, where = beside.values_per_metre, beside.path.name
+        scales = (
+            (values_per_metre, "as given"),
+            (sidecar.values_per_metre, SIDECAR),
+            (beside.values_per_metre, beside.path.name),
+        )
+        said, where = next((each for each in scales if each[0] is not None), (None, ""))
         self._convert, scale = self._conversion(said, where, marks)
         self._colours = Colours(self.found, sidecar, colouring, self._timestamps_us)
         self.notes += tuple(f"'{self.uri}': {note}" for note in self._colours.notes)
@@ -177,7 +179,7 @@ class RecordedFolder(DepthSource):
         return read_raw(self._files[index]) if self._stack is None else self._stack[index]
 
     def _camera(
-        self, shape: tuple[int, ...], given: tuple[float, ...] | None, sidecar: Camera | None, beside: CameraFile | None
+        self, shape: tuple[int, ...], given: tuple[float, ...] | None, sidecar: Camera | None, beside: CameraFile
     ) -> tuple[Camera, str]:
         """The camera, and where it comes from."""
         height, width = shape
@@ -186,11 +188,11 @@ class RecordedFolder(DepthSource):
             return Camera(width, height, *given), "as given"
         if sidecar is not None:
             return sidecar, SIDECAR
-        if beside is not None and beside.intrinsics is not None:
+        if beside.intrinsics is not None:
             if camera := beside.camera(width, height):
                 if beside.varies:
                     self.notes += (
-                        f"'{beside.path}' has other intrinsics for other frames; those of its first are used for all.",
+                        f"'{beside.path}' has different intrinsics for different frames; the first are used for all.",
                     )
                 return camera, beside.path.name
             self.notes += (
@@ -210,7 +212,7 @@ class RecordedFolder(DepthSource):
         Raises
         ------
         SourceError
-            If the scale is only the custom, and what it makes of the frames cannot be.
+            If the scale is merely the usual one, and what it makes of the frames is impossible.
         """
         row = self.found.row
         png = self._stack is None and self._files[0].suffix.lower() == ".png"
@@ -263,9 +265,9 @@ class RecordedFolder(DepthSource):
                 )
         elif near_m < _NEAREST_M or median_m < _NEAR_M:
             raise SourceError(
-                f"the scale of '{self.uri}' is not known: at {scale:g} values a metre, the custom"
-                f" of its layout, half of it would be nearer than {median_m:.2g} m. Give --scale"
-                f" 1000 if its values are millimetres, or --scale {scale:g} if it is so near."
+                f"the scale of '{self.uri}' is not known: at {scale:g} values a metre, usual"
+                f" for its layout, half of it would be nearer than {median_m:.2g} m. Give --scale"
+                f" 1000 if its values are millimetres, or --scale {scale:g} if it really is that near."
             )
 
 

@@ -150,7 +150,7 @@ def read_text(path: Path) -> str:
         data = file.read(_MAX_TEXT_BYTES + 1)
     if len(data) > _MAX_TEXT_BYTES:
         raise DamagedRecordingError(
-            f"'{path}' is larger than {_MAX_TEXT_BYTES // 2**20} MiB, which no sidecar is; remove it."
+            f"'{path}' is larger than {_MAX_TEXT_BYTES // 2**20} MiB, too large for such a file; remove it."
         )
     try:
         return data.decode("utf-8-sig")
@@ -211,7 +211,7 @@ def _camera(name: str, value: Any) -> Camera:
     try:
         return Camera(**numbers)
     except ValueError as error:
-        raise _WrongEntryError(name, error, "a camera that can be") from error
+        raise _WrongEntryError(name, error, "a possible camera") from error
 
 
 _PX = _number(-MOST_PX, MOST_PX)

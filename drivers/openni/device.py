@@ -37,7 +37,7 @@ _MISFITS = 15  # so many wrong frames in a row, and the sensor is set up afresh
 _BACK_OFF_S = (0.2, 0.4, 0.8, 1.5)  # pauses between attempts, the last one for ever
 _NO_FRAMES = (
     " Plug it into a port of its own, not a hub, away from other cameras (a bus has room for one);"
-    " check its power supply; in a virtual machine, hand on the whole USB controller."
+    " check its power supply; in a virtual machine, pass the whole USB controller through."
 )
 _GRACE_S = 1.0  # for a worker to stop the sensor before it is killed
 _PAIR_S = 0.01  # how soon a frame that waits for its colour is handed on without
@@ -191,7 +191,7 @@ class OpenNIDevice(DepthSource):
         wanted = (self.settings.width, self.settings.height, self.settings.fps)
         taken = (camera.width, camera.height, int(about["fps"]))
         if taken != wanted:
-            text = "it has no {}x{}@{}; {}x{}@{} is taken, and --mode takes another"
+            text = "it does not offer {}x{}@{}; {}x{}@{} is used instead, --mode chooses another"
             notes += (text.format(*wanted, *taken),)
         notes += (about["colour_trouble"],) if about["colour_trouble"] else ()
         self.notes = tuple(f"{self.uri}: {note}." for note in notes)

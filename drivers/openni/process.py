@@ -50,7 +50,7 @@ def camera_of(stream: Message, given: tuple[float, ...] | None = None) -> tuple[
     advice = "; give --camera fx,fy,cx,cy if you know them"
     if all(math.pi < angle < 180 for angle in angles):
         camera = Camera.from_fov(*size, *map(math.radians, angles))
-        return camera, (f"its driver states its field of view in degrees, which is read so{advice}",)
+        return camera, (f"its driver states its field of view in degrees and is read as such{advice}",)
     if not all(0 < angle < math.pi for angle in angles):
         return Camera.kinect(*size), (f"its driver states no field of view: a Kinect's intrinsics are assumed{advice}",)
     camera = Camera.from_fov(*size, *angles)

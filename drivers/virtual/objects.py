@@ -60,7 +60,7 @@ class MeshSource(DepthSource):
     Raises
     ------
     SourceNotFoundError
-        If there is no such file, it is no PLY, or an option is unknown.
+        If there is no such file, it is not a PLY file, or an option is unknown.
     DamagedRecordingError
         If the file is damaged.
     """

@@ -165,7 +165,7 @@ def _binary(text: bytes, elements: list[_Element]) -> bytes:
     try:
         numbers = np.fromiter(map(float, words), "<f8", len(words))
     except ValueError as error:
-        raise _BadPlyError(f"its text holds something else than numbers ({error!s:.100})") from error
+        raise _BadPlyError(f"its text holds something other than numbers ({error!s:.100})") from error
     for element in elements:
         for each in element.properties:
             each.scalar, each.count = "d", each.count and "d"

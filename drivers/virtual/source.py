@@ -46,7 +46,7 @@ class VirtualSource(DepthSource):
         ``moving=ball``, or more of `MOVING` with ``+`` between: what else moves;
         ``cut=ball@20``, to another scene, from that frame on;
         ``size=640x480``, the field of view's width stays that of a Kinect;
-        ``colour=off``: no colour image, which else lies on the depth image;
+        ``colour=off``: no colour image; otherwise there is one, registered to depth;
         ``live=0`` or ``1``: paced at 30 frames a second like a device, the newest frame wins.
 
     Raises

@@ -114,7 +114,7 @@ def test_colour_that_cannot_be_read_is_said_once(tmp_path: Path, capfd: pytest.C
     (tmp_path / "rgb" / "1.jpg").write_bytes(b"")
     with open_source(f"{tmp_path}?colour=registered") as source:
         assert [frame.colour is None for frame in source] == [True, True, False]
-        assert [note for note in source.notes if "no colour image that can be read" in note] == list(source.notes[-1:])
+        assert [note for note in source.notes if "cannot be read as a colour image" in note] == list(source.notes[-1:])
     assert capfd.readouterr().err == ""
 
 

@@ -356,7 +356,7 @@ def test_damaged_files_print_nothing(tmp_path: Path, capfd: pytest.CaptureFixtur
 @pytest.mark.parametrize("line", ["1.0 ../secret.png", "1.0 /etc/secret.png", "1.0 depth/../../x.png", "1.0 C:\\x.png"])
 def test_a_tum_list_cannot_lead_outside_of_its_folder(tmp_path: Path, line: str) -> None:
     (tmp_path / "depth.txt").write_text(line)
-    with pytest.raises(DamagedRecordingError, match="outside of the folder"):
+    with pytest.raises(DamagedRecordingError, match="outside the folder"):
         RecordedFolder(tmp_path)
 
 

@@ -101,7 +101,7 @@ def test_the_nearest_mode_is_taken_and_said(virtual_sensor: VirtualSensor) -> No
     virtual_sensor.set(width=512, height=424)
     with open_source("openni") as device:
         assert (device.camera.width, device.camera.height) == (512, 424)
-        assert "it has no 640x480@30; 512x424@30 is taken" in device.notes[0]
+        assert "it does not offer 640x480@30; 512x424@30 is used" in device.notes[0]
         assert device.read().shape == (424, 512)
 
 

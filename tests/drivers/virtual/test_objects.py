@@ -136,7 +136,7 @@ HEADER = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty fl
         (HEADER + "property float z\nend_header\n1 2\n", "ends within its 1 rows of 'vertex'"),
         (HEADER + "property float z\nend_header\n1 2 nan\n", "not finite"),
         (HEADER + "property float z\nend_header\n1 2 1e300\n", "beyond 1e"),
-        (HEADER + "property float z\nend_header\n1 2 three\n", "something else than numbers"),
+        (HEADER + "property float z\nend_header\n1 2 three\n", "something other than numbers"),
         (HEADER + "property string z\nend_header\n1 2 3\n", "property string z"),
         (HEADER.replace("1\np", "99999999999\np") + "end_header\n1 2\n", "ends within its 99999999999 rows"),
         (
