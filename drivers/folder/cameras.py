@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.io import loadmat
 
-from selective_depth.drivers.errors import DamagedRecordingError
+from selective_depth.drivers.folder.images import damaged
 from selective_depth.drivers.folder.sidecar import read_text
 from selective_depth.drivers.frame import Camera
 
@@ -95,10 +95,8 @@ def find_camera_file(root: Path) -> CameraFile:
             return CameraFile(path, tuple(numbers[2:]), size)  # type: ignore[arg-type]
         return CameraFile(path, _matrix(numbers))
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
-        raise DamagedRecordingError(
-            f"'{path}' holds no intrinsics in a known form ({error!s:.80}); put the"
-            " camera and the scale into frames.toml, and rename or remove this file."
-        ) from error
+        advice = "put the camera and the scale into frames.toml, and rename or remove this file"
+        raise damaged(path, f"holds no intrinsics in a known form ({error!s:.80})", advice) from error
 
 
 def _matrix(numbers: Sequence[float], columns: bool = False) -> tuple[float, float, float, float]:

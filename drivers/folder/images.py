@@ -30,7 +30,13 @@ _GREY: Final = ("I;16", "I;16B", "I", "F")
 """Pillow's modes of depth images; of PNG files, the first."""
 _COLOURS: Final = {"1": "a black-and-white", "L": "an 8-bit grey", "P": "a palette", "LA": "an 8-bit grey + alpha",
                 "RGB": "a colour", "RGBA": "a colour + alpha"}  # fmt: skip
+_ALLOWED: Final = f"allowed are 1 to {MAX_SIDE} pixels each way"
 _NEXT: Final = "depth images are grey, of 16 bits or floating point; convert this file or remove it from the folder"
+
+
+def damaged(path: Path, what: str, advice: str = _NEXT) -> DamagedRecordingError:
+    """The error of a file: what is wrong with it, and what to do."""
+    return DamagedRecordingError(f"'{path}' {what}; {advice}.")
 
 
 def is_depth_png(path: Path) -> bool:
@@ -56,9 +62,8 @@ def read_raw(path: Path) -> npt.NDArray[Any]:
     if suffix in (".npy", ".npz"):
         stack = read_stack(path)
         if len(stack) != 1:
-            raise DamagedRecordingError(
-                f"'{path}' holds {len(stack)} frames; each file of a folder is one frame. Open it by its own name."
-            )
+            advice = "each file of a folder is one frame. Open this one by its own name"
+            raise damaged(path, f"holds {len(stack)} frames", advice)
         return np.array(stack[0])
     if suffix == ".exr":
         return _read_exr(path)
@@ -70,7 +75,7 @@ def read_raw(path: Path) -> npt.NDArray[Any]:
         with Image.open(data) as image:
             return np.array(image, None if image.mode == "F" else np.uint16)
     except DAMAGED as error:
-        raise _damaged(path, error) from error
+        raise _cut_off(path, error) from error
 
 
 def read_size(path: Path) -> tuple[int, int]:
@@ -101,19 +106,16 @@ def read_stack(path: Path) -> npt.NDArray[Any]:
                     raise ValueError(f"it holds {', '.join(names)}; name the one array 'depth'")
                 loaded = _unpacked(path, names[0])
     except (*DAMAGED, tokenize.TokenError, zipfile.BadZipFile) as error:
-        raise DamagedRecordingError(
-            f"'{path}' cannot be read as a NumPy array of depth ({error!s:.120}); write it again with numpy.save."
-        ) from error
+        what = f"cannot be read as a NumPy array of depth ({error!s:.120})"
+        raise damaged(path, what, "write it again with numpy.save") from error
     array: npt.NDArray[Any] = loaded
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[..., 0]
     array = array[None] if array.ndim == 2 else array
     kind = array.dtype.kind in "iuf" and (array.dtype.kind == "f" or array.dtype.itemsize > 1)
     if array.ndim != 3 or not kind or 0 in array.shape or max(array.shape[1:]) > MAX_SIDE:
-        raise DamagedRecordingError(
-            f"'{path}' holds {array.dtype} of shape {array.shape}; depth is (height, width) or"
-            " (frames, height, width), of whole numbers of 16 bits or more or floating point."
-        )
+        allowed = "(height, width) or (frames, height, width), of whole numbers of 16 bits or more or floating point"
+        raise damaged(path, f"holds {array.dtype} of shape {array.shape}", f"depth is {allowed}")
     return array
 
 
@@ -136,13 +138,11 @@ def _read_exr(path: Path) -> npt.NDArray[Any]:
     try:
         import OpenEXR
     except ImportError:
-        raise DamagedRecordingError(
-            f"'{path}' is an EXR image, which needs the package OpenEXR: pip install OpenEXR."
-        ) from None
+        raise damaged(path, "is an EXR image, which needs the package OpenEXR", "pip install OpenEXR") from None
     try:
         channels = OpenEXR.File(str(path), separate_channels=True).channels()
     except (RuntimeError, ValueError, OSError) as error:
-        raise _damaged(path, error) from error
+        raise _cut_off(path, error) from error
     name = next((n for n in ("Z", "Y", "R", "V") if n in channels), None) or next(iter(channels))
     return np.asarray(channels[name].pixels, np.float32)
 
@@ -183,12 +183,11 @@ def opened(path: Path, remedy: str) -> BinaryIO:
     try:
         # Opening a pipe or a device in the folder would wait for ever.
         if not path.is_file():
-            raise DamagedRecordingError(f"'{path}' is not a regular file; {remedy}.")
+            raise damaged(path, "is not a regular file", remedy)
         return path.open("rb")
     except OSError as error:
-        raise DamagedRecordingError(
-            f"'{path}' cannot be read ({error.strerror}); check that it is there and its permissions."
-        ) from error
+        advice = "check that it is there and its permissions"
+        raise damaged(path, f"cannot be read ({error.strerror})", advice) from error
 
 
 def _header(path: Path, file: BinaryIO) -> Image.Image:
@@ -201,9 +200,7 @@ def _header(path: Path, file: BinaryIO) -> Image.Image:
     try:
         image = Image.open(file, formats=formats)
     except BOMBS as error:
-        raise DamagedRecordingError(
-            f"'{path}' claims to be larger ({error}) than is allowed, 1 to {MAX_SIDE} pixels each way."
-        ) from None
+        raise damaged(path, f"claims to be larger ({error})", _ALLOWED) from None
     except DAMAGED:
         file.seek(0)
         start = file.read(24)
@@ -212,18 +209,13 @@ def _header(path: Path, file: BinaryIO) -> Image.Image:
             what = "cut off"
         elif start.startswith(b"version https://git-lfs"):
             what = "a Git LFS pointer and not the image; `git lfs pull` fetches it"
-        raise DamagedRecordingError(f"'{path}' is {what if start else 'empty'}; {_NEXT}.") from None
+        raise damaged(path, f"is {what if start else 'empty'}") from None
     if image.mode not in modes:
-        what = _COLOURS.get(image.mode, f"a {image.mode}")
-        raise DamagedRecordingError(f"'{path}' is {what} {image.format}; {_NEXT}.")
+        raise damaged(path, f"is {_COLOURS.get(image.mode, f'a {image.mode}')} {image.format}")
     if max(image.size) > MAX_SIDE:
-        raise DamagedRecordingError(
-            f"'{path}' claims to be {image.width}x{image.height} pixels; allowed are 1 to {MAX_SIDE} each way."
-        )
+        raise damaged(path, f"claims to be {image.width}x{image.height} pixels", _ALLOWED)
     return image
 
 
-def _damaged(path: Path, error: Exception) -> DamagedRecordingError:
-    return DamagedRecordingError(
-        f"'{path}' is damaged or cut off ({error}); copy it again, or remove it from the folder."
-    )
+def _cut_off(path: Path, error: Exception) -> DamagedRecordingError:
+    return damaged(path, f"is damaged or cut off ({error})", "copy it again, or remove it from the folder")

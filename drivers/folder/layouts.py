@@ -61,7 +61,7 @@ class Layout:
     camera : Camera, optional
         Intrinsics at their own size; without, those of a Kinect are assumed.
     signs : tuple of str
-        Patterns from the root, each of which must be there.
+        Patterns from the root, each of which must be there; alternatives with ``|`` between.
     named : str
         Regular expression that must be found in the root's full name.
     lists : tuple of str
@@ -137,24 +137,15 @@ LAYOUTS: Final = (
     Layout("BOP", "depth/*", signs=("scene_camera.json",), colour="rgb/*", registered=True),
     Layout("SUN3D", "depth/*.png", camera=_XTION, signs=("intrinsics.txt", "image"), stamp=_STAMP,
            convert=_rotated, colour="image/*.jpg", registered=True),
-    *(
-        Layout("ScanNet", "depth/*", signs=(sign,), colour="color/*")
-        for sign in ("intrinsic/intrinsic_depth.txt", "intrinsic_depth.txt")
-    ),
+    Layout("ScanNet", "depth/*", signs=("intrinsic/intrinsic_depth.txt|intrinsic_depth.txt",), colour="color/*"),
     Layout("Open3D / RealSense", "depth/*.png", signs=("camera_intrinsic.json",), assumed=True,
            colour="color/*", registered=True),
     Layout("Open3D / Azure Kinect", "depth/*.png", signs=("intrinsic.json",), assumed=True,
            colour="color/*", registered=True),
-    *(
-        Layout("BundleFusion", "frame-*.depth.p[ng][gm]", signs=(sign,), marks=(65535,),
-               colour="frame-*.color.*")
-        for sign in ("info.txt", "_info.txt")
-    ),
-    *(
-        Layout("3DMatch", "frame-*.depth.png", signs=(sign,), marks=(65535,),
-               colour="frame-*.color.png")
-        for sign in ("camera-intrinsics.txt", "../camera-intrinsics.txt")
-    ),
+    Layout("BundleFusion", "frame-*.depth.p[ng][gm]", signs=("info.txt|_info.txt",), marks=(65535,),
+           colour="frame-*.color.*"),
+    Layout("3DMatch", "frame-*.depth.png", signs=("camera-intrinsics.txt|../camera-intrinsics.txt",),
+           marks=(65535,), colour="frame-*.color.png"),
     Layout("7-Scenes", "*.depth.png", camera=_KINECT, marks=(65535,), colour="*.color.png"),
     Layout("YCB-Video", "*-depth.png", 10_000.0,
            Camera(640, 480, 1066.778, 1067.487, 312.9869, 241.3109), signs=("*-meta.mat",),
@@ -226,7 +217,7 @@ def _match(row: Layout, folder: Path, up: int) -> Found | None:
     way = zip(full.parts[len(full.parts) - up :], row.depth.split("/"), strict=False)
     if (
         not all(fnmatch(part, pattern) for part, pattern in way)
-        or not all(any(root.glob(sign)) for sign in row.signs)
+        or not all(any(any(root.glob(each)) for each in sign.split("|")) for sign in row.signs)
         or (row.named and not re.search(row.named, root.resolve().name))
         or (row.name == "Redwood" and image_names(root))
     ):

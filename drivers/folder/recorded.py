@@ -21,7 +21,7 @@ from selective_depth.drivers.colour import ON, Colouring
 from selective_depth.drivers.errors import DamagedRecordingError, SourceEndedError, SourceError, SourceTimeoutError
 from selective_depth.drivers.folder.cameras import CameraFile, find_camera_file
 from selective_depth.drivers.folder.colours import Colours
-from selective_depth.drivers.folder.images import read_raw, read_size, read_stack
+from selective_depth.drivers.folder.images import damaged, read_raw, read_size, read_stack
 from selective_depth.drivers.folder.layouts import ARRAYS, Found, doubtful_order, find_layout
 from selective_depth.drivers.folder.sidecar import DEFAULT_FPS, MILLIMETRES, SIDECAR, Sidecar, read_sidecar
 from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame, millimetres
@@ -103,10 +103,8 @@ class RecordedFolder(DepthSource):
         self._timestamps_us = sidecar.timestamps_us or self.found.timestamps_us
         for name, times in (("", self._timestamps_us), ("colour_", sidecar.colour_timestamps_us)):
             if times is not None and len(times) != self.frame_count:
-                raise DamagedRecordingError(
-                    f"'{path}' holds {self.frame_count} frames, but {SIDECAR} lists"
-                    f" {len(times)} {name}timestamps; correct the list or remove it."
-                )
+                what = f"holds {self.frame_count} frames, but {SIDECAR} lists {len(times)} {name}timestamps"
+                raise damaged(path, what, "correct the list or remove it")
         self.fps = sidecar.fps or _fps_from(self._timestamps_us)
         marks = self.found.row.marks if sidecar.missing is None else sidecar.missing
         scales = (
@@ -283,10 +281,8 @@ def _shape_of(files: list[Path], stated: Camera | None) -> tuple[int, int]:
 
 
 def _size_error(path: Path, shape: tuple[int, ...], camera: Camera) -> DamagedRecordingError:
-    return DamagedRecordingError(
-        f"'{path}' is {shape[1]}x{shape[0]} pixels, but this recording is {camera.width}x{camera.height}; keep frames"
-        f" of one size in a folder, and correct {SIDECAR} if it has one."
-    )
+    what = f"is {shape[1]}x{shape[0]} pixels, but this recording is {camera.width}x{camera.height}"
+    return damaged(path, what, f"keep frames of one size in a folder, and correct {SIDECAR} if it has one")
 
 
 def _fps_from(timestamps_us: tuple[int, ...] | None) -> float:

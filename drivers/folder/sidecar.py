@@ -36,7 +36,7 @@ import numpy as np
 import tomli_w
 
 from selective_depth.drivers.errors import DamagedRecordingError
-from selective_depth.drivers.folder.images import MAX_SIDE, opened
+from selective_depth.drivers.folder.images import MAX_SIDE, damaged, opened
 from selective_depth.drivers.frame import MOST_PX, MOST_TIME_US, Camera
 
 SIDECAR: Final = "frames.toml"
@@ -103,9 +103,8 @@ def read_sidecar(folder: Path) -> Sidecar:
     try:
         entries = tomllib.loads(read_text(path))
     except (ValueError, RecursionError) as error:
-        raise DamagedRecordingError(
-            f"'{path}' is not valid TOML ({str(error) or 'nested too deep'}); correct it, or remove it to use defaults."
-        ) from error
+        advice = "correct it, or remove it to use defaults"
+        raise damaged(path, f"is not valid TOML ({str(error) or 'nested too deep'})", advice) from error
     try:
         schema = entries.pop("schema", SCHEMA)
         if not isinstance(schema, int) or schema is True or schema > SCHEMA:
@@ -149,15 +148,11 @@ def read_text(path: Path) -> str:
     with opened(path, "remove it") as file:
         data = file.read(_MAX_TEXT_BYTES + 1)
     if len(data) > _MAX_TEXT_BYTES:
-        raise DamagedRecordingError(
-            f"'{path}' is larger than {_MAX_TEXT_BYTES // 2**20} MiB, too large for such a file; remove it."
-        )
+        raise damaged(path, f"is larger than {_MAX_TEXT_BYTES // 2**20} MiB, too large for such a file", "remove it")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DamagedRecordingError(
-            f"'{path}' is not UTF-8 text (byte {error.start}); correct it, or remove it."
-        ) from error
+        raise damaged(path, f"is not UTF-8 text (byte {error.start})", "correct it, or remove it") from error
 
 
 def _plain(value: Any) -> Any:
