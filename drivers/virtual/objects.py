@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from selective_depth.drivers.errors import SourceEndedError, SourceNotFoundError
-from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
+from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame, millimetres
 from selective_depth.drivers.kernels import njit
 from selective_depth.drivers.options import Options, parted
 from selective_depth.drivers.source import DepthSource
@@ -25,7 +25,6 @@ object stands about 2 m away, as the scenes of the paper do.
 _SMALLEST = 1e-100  # extent of an object; below, it is one point
 _MARGIN = 0.02  # share of the frame left free on each side
 _NEAREST_MM = 100.0  # no part of the object comes closer to the camera than this
-_FARTHEST_MM = 65535  # what a uint16 can hold
 
 # Rows: where right, down and forward of the viewer point in the object's axes, with y up and
 # its front towards +z, as the Stanford models stand.
@@ -164,8 +163,7 @@ def render(
     else:
         _fill_points(u, v, inverse, splat or _splat_for(u, v), nearness)
     with np.errstate(divide="ignore"):
-        depth = np.where(nearness > 0, np.rint(1.0 / nearness), 0)
-    return np.where(depth <= _FARTHEST_MM, depth, 0).astype(np.uint16)
+        return millimetres(1.0 / nearness, 1000.0)
 
 
 def cut_to_object(depth_mm: DepthArray, camera: Camera) -> tuple[DepthArray, Camera]:

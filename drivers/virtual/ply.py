@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -182,32 +181,31 @@ def _read_element(data: bytes, at: int, order: str, element: _Element, columns: 
     size = (end - at) * element.rows
     alike = _table(data, at, order, element, found) if size <= len(data) - at else None
     found, end = (alike, at + size) if alike else _walk(data, at, order, element, element.rows)
-    for each, (lengths, items) in zip(element.properties, found, strict=True):
-        columns[element.name, each.name] = _Column(np.asarray(lengths, np.int64), np.asarray(items, np.float64))
+    for each, column in zip(element.properties, found, strict=True):
+        columns[element.name, each.name] = column
     return end
 
 
-_Lists = Sequence[tuple[Sequence[int] | npt.NDArray[Any], Sequence[float] | npt.NDArray[Any]]]
-"""Of each property: the lists' lengths, one a row, and their items, end to end."""
-
-
-def _table(data: bytes, at: int, order: str, element: _Element, first: _Lists) -> _Lists | None:
+def _table(data: bytes, at: int, order: str, element: _Element, first: list[_Column]) -> list[_Column] | None:
     """The usual case: rows laid out as the first one, whose lists are of its lengths; None of others."""
     row: list[tuple[Any, ...]] = []
-    for k, (each, (_, items)) in enumerate(zip(element.properties, first, strict=True)):
+    for k, (each, column) in enumerate(zip(element.properties, first, strict=True)):
         row += [(f"length {k}", order + each.count)] if each.count else []
-        row += [(f"items {k}", order + each.scalar, (len(items),))]
+        row += [(f"items {k}", order + each.scalar, (len(column.items),))]
     try:
         table = np.frombuffer(data, np.dtype(row), element.rows, at)
     except ValueError:  # rows of gigabytes
         return None
-    for k, (each, (_, items)) in enumerate(zip(element.properties, first, strict=True)):
-        if each.count and (table[f"length {k}"] != len(items)).any():
+    found = []
+    for k, (each, column) in enumerate(zip(element.properties, first, strict=True)):
+        if each.count and (table[f"length {k}"] != len(column.items)).any():
             return None
-    return [(np.full(len(table), len(items)), table[f"items {k}"].ravel()) for k, (_, items) in enumerate(first)]
+        items = table[f"items {k}"].ravel().astype(np.float64)
+        found.append(_Column(np.full(element.rows, len(column.items)), items))
+    return found
 
 
-def _walk(data: bytes, at: int, order: str, element: _Element, rows: int) -> tuple[_Lists, int]:
+def _walk(data: bytes, at: int, order: str, element: _Element, rows: int) -> tuple[list[_Column], int]:
     """The next rows one by one, and the byte after them."""
     readers = [each.count and struct.Struct(order + each.count) for each in element.properties]
     found = [(array("q"), array("d")) for _ in readers]
@@ -226,7 +224,7 @@ def _walk(data: bytes, at: int, order: str, element: _Element, rows: int) -> tup
             lengths.append(length)
             items.extend(struct.unpack_from(f"{order}{length}{each.scalar}", data, at))
             at += size
-    return found, at
+    return [_Column(np.array(lengths, np.int64), np.array(items, np.float64)) for lengths, items in found], at
 
 
 def _check_room(data: bytes, at: int, needed: int, element: _Element) -> None:
