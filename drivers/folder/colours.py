@@ -8,8 +8,8 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Final
 
-from selective_depth.drivers.colour import Colouring, nearest, rgb_of_file
-from selective_depth.drivers.folder.layouts import Found, stamps_of
+from selective_depth.drivers.colour import Colouring, rgb_of_file
+from selective_depth.drivers.folder.layouts import Found, nearest_images, stamps_of
 from selective_depth.drivers.folder.sidecar import Sidecar
 from selective_depth.drivers.frame import DepthFrame
 
@@ -49,22 +49,12 @@ class Colours:
         told = (camera.fx, camera.fy, camera.cx, camera.cy) if camera else None
         self._colouring = colouring.told_by(told, sidecar.colour_place_mm)
         self._registered = found.row.registered if sidecar.colour_registered is None else sidecar.colour_registered
-        self._files: list[Path | None] = []
-        self._times_us = sidecar.colour_timestamps_us
-        if not colouring.wanted:
+        self._images = _paired(found, timestamps_us, sidecar.colour_timestamps_us) if colouring.wanted else []
+        files = [image[1] for image in self._images if image]
+        if not files:
+            self._images = []
             return
-        images = _images(found)
-        if found.colour is not None:
-            self._files = [pair[1] if pair else None for pair in found.colour]
-            self._times_us = tuple(pair[0] if pair else 0 for pair in found.colour)
-        elif images:
-            self._pair(found, images, timestamps_us)
-        count = sum(each is not None for each in self._files)
-        if not count:
-            self._files = []
-            return
-        folder = next(each for each in self._files if each).parent
-        self.about = f"; colour of {count} of {len(self._files)} frames from '{folder}'"
+        self.about = f"; colour of {len(files)} of {len(self._images)} frames from '{files[0].parent}'"
         if not (self._registered or self._colouring.registered or self._colouring.place_mm):
             self.notes = (
                 "nothing says that its colour images lie on its depth images, so the cloud is not coloured;"
@@ -73,26 +63,30 @@ class Colours:
 
     def on(self, frame: DepthFrame) -> tuple[DepthFrame, str]:
         """A frame with its colour, if it has any; and a sentence where that cannot be read."""
-        path = self._files[frame.index] if self._files else None
-        if path is None:
+        image = self._images[frame.index] if self._images else None
+        if image is None:
             return frame, ""
+        time_us, path = image
         colour = rgb_of_file(path)
         if colour is None:
             return frame, f"'{path}' cannot be read as a colour image; its frame has no colour."
-        time_us = self._times_us[frame.index] if self._times_us else frame.timestamp_us
+        time_us = frame.timestamp_us if time_us is None else time_us
         return self._colouring.colour(frame, colour, time_us, self._registered), ""
 
-    def _pair(self, found: Found, images: list[Path], depth_us: Sequence[int] | None) -> None:
-        times = stamps_of(found.row, images) if found.timestamps_us else None
-        if times and depth_us and self._times_us is None:
-            order = sorted(range(len(images)), key=lambda k: times[k])
-            rising = [times[k] for k in order]
-            near = [nearest(rising, time_us) for time_us in depth_us]
-            self._files = [None if k is None else images[order[k]] for k in near]
-            self._times_us = tuple(0 if k is None else rising[k] for k in near)
-        else:
-            by_number = {_numbers(path): path for path in images}
-            self._files = [by_number.get(_numbers(path)) for path in found.files]
+
+def _paired(
+    found: Found, depth_us: Sequence[int] | None, told_us: Sequence[int] | None
+) -> Sequence[tuple[int | None, Path] | None]:
+    """Time and image for each frame: times that are told go with the numbers in the names."""
+    if found.colour is not None:
+        return found.colour
+    images = _images(found)
+    times_us = stamps_of(found.row, images) if found.timestamps_us and told_us is None else None
+    if times_us and depth_us:
+        return nearest_images(list(zip(times_us, images, strict=True)), depth_us)
+    by_number = {_numbers(path): path for path in images}
+    own = [by_number.get(_numbers(path)) for path in found.files]
+    return [(told_us[k] if told_us else None, path) if path else None for k, path in enumerate(own)]
 
 
 def _images(found: Found) -> list[Path]:

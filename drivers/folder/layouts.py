@@ -9,7 +9,7 @@ is in ``app/docs/recordings.md`` with the source of each.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from fnmatch import fnmatch
@@ -307,10 +307,16 @@ def _read_list(root: Path, index: Path) -> tuple[list[Path], tuple[int, ...], _C
         return files, times_us, tuple(next(_there(root, pairs[1:2]), None) for _, pairs in lines)
     if not (root / "rgb.txt").is_file():
         return files, times_us, None
-    images = sorted(image for _, pairs in _pairs(root / "rgb.txt") for image in _there(root, pairs))
+    images = [image for _, pairs in _pairs(root / "rgb.txt") for image in _there(root, pairs)]
+    return files, times_us, nearest_images(images, times_us)
+
+
+def nearest_images(images: list[tuple[int, Path]], times_us: Sequence[int]) -> _Colour:
+    """For each time the image nearest to it; None where none is of the same moment."""
+    images = sorted(images)
     rising = [time_us for time_us, _ in images]
     near = [nearest(rising, time_us) for time_us in times_us]
-    return files, times_us, tuple(None if k is None else images[k] for k in near)
+    return tuple(None if k is None else images[k] for k in near)
 
 
 def _there(root: Path, pairs: list[tuple[int, str]]) -> Iterator[tuple[int, Path]]:
