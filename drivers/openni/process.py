@@ -111,11 +111,6 @@ class Worker:
         }
         self._tell(json.dumps(start))
 
-    @property
-    def pid(self) -> int:
-        """Process number, for tests and messages."""
-        return self._process.pid
-
     def receive(self, timeout_s: float) -> Message | None:
         """The next message, or None if none comes in time.
 

@@ -108,16 +108,6 @@ class VirtualSource(DepthSource):
             self.tap(frame)
         return frame
 
-    def depth_at(self, index: int, *, noise: bool) -> DepthArray:
-        """Depth of frame `index`, exact or as a Kinect reports it, whatever was read so far.
-
-        Returns
-        -------
-        uint16 array of shape (height, width)
-            Millimetres, 0 = no measurement.
-        """
-        return self._render(index, noise=noise)[0]
-
     def _render(
         self, index: int, *, noise: bool, coloured: bool = False
     ) -> tuple[DepthArray, DepthArray, ColourArray | None]:

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selective_depth.drivers.open import open_source
-from selective_depth.drivers.virtual.source import VirtualSource
 from selective_depth.selectors.acquire import acquire
 from selective_depth.selectors.arrays import pixels_where
 from selective_depth.selectors.even import EvenSelector
@@ -319,8 +318,7 @@ def test_where_the_budget_pays_for_it_a_memory_is_on_probation() -> None:
 
 def test_repeats_are_worth_it_on_a_noisy_still_scene() -> None:
     source = open_source("virtual:workstation?speed=0&frames=10&size=320x240")
-    assert isinstance(source, VirtualSource)
-    truth = source.depth_at(0, noise=False)
+    truth = open_source("virtual:workstation?speed=0&noise=off&size=320x240").read().depth_mm
     memory = TemporalAcquisition((240, 320), budget=0.05, seeds=(64, 64))
     known, errors = [], []
     for frame in source:

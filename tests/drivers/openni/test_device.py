@@ -183,7 +183,7 @@ def test_a_hang_of_the_runtime_is_survived(virtual_sensor: VirtualSensor, monkey
     monkeypatch.setattr("selective_depth.drivers.openni.device._HANG_S", 0.7)
     with OpenNIDevice() as device:
         device.read()
-        os.kill(device._worker.pid, signal.SIGSTOP)
+        os.kill(device._worker._process.pid, signal.SIGSTOP)
         wait_for(lambda: device.restarts == 1)
         sensor_frame(next_frame(device))
 
@@ -213,7 +213,7 @@ def test_a_fault_of_our_own_reaches_the_reader(virtual_sensor: VirtualSensor, mo
         with pytest.raises(ZeroDivisionError, match="on purpose"):
             for _ in range(3):  # what came before may still be read
                 device.read(timeout_s=1)
-        wait_for(lambda: not is_running(device._worker.pid))
+        wait_for(lambda: not is_running(device._worker._process.pid))
 
 
 def test_numbers_and_times_go_on_rising(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -410,7 +410,7 @@ import os, signal, sys, time
 from selective_depth.drivers.openni import OpenNIDevice
 device = OpenNIDevice()
 device.read()
-print(device._worker.pid, flush=True)
+print(device._worker._process.pid, flush=True)
 while True:
     device.read()
     if sys.argv[1] == "exception":

@@ -32,7 +32,7 @@ def kill_and_read_on(times: int) -> float:
         for _ in range(times):
             last = device.read()
             time.sleep(draw.uniform(0, 0.2))
-            os.kill(device._worker.pid, signal.SIGKILL)
+            os.kill(device._worker._process.pid, signal.SIGKILL)
             killed_s, restarts = time.monotonic(), device.restarts
             while device.restarts == restarts:
                 assert time.monotonic() < killed_s + 10
@@ -76,7 +76,7 @@ def kill_while_recording(folder: Path, times: int, monkeypatch: pytest.MonkeyPat
             while not opened:
                 time.sleep(0.005)
             time.sleep(wait_s)
-            os.kill(opened[0]._worker.pid, signal.SIGKILL)
+            os.kill(opened[0]._worker._process.pid, signal.SIGKILL)
 
         killer = threading.Thread(target=kill)
         killer.start()
@@ -108,7 +108,7 @@ def test_two_sensors_at_once_and_one_of_them_killed(virtual_sensor: VirtualSenso
         assert (one.device.serial, other.device.serial) == ("A", "B")
         for _ in range(10):
             assert one.read().depth_mm.any() and other.read().depth_mm.any()
-        os.kill(one._worker.pid, signal.SIGKILL)
+        os.kill(one._worker._process.pid, signal.SIGKILL)
         seen = [other.read() for _ in range(20)]
         assert other.restarts == 0 and np.diff([frame.index for frame in seen]).min() >= 1
         deadline = time.monotonic() + 10
