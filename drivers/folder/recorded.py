@@ -72,8 +72,6 @@ class RecordedFolder(DepthSource):
         If the scale cannot be known.
     """
 
-    live = False
-
     def __init__(
         self,
         path: str | Path,
@@ -97,7 +95,6 @@ class RecordedFolder(DepthSource):
         self._files = self.found.files
         self.notes = doubtful_order(self._files)
         self.frame_count = len(self._files)
-        self.dropped = 0
         shape = _shape_of(self._files, sidecar.camera) if self._stack is None else self._stack.shape[1:]
         self.camera, camera_from = self._camera(shape, intrinsics, sidecar.camera, beside)
         self._timestamps_us = sidecar.timestamps_us or self.found.timestamps_us

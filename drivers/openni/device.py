@@ -146,6 +146,8 @@ class OpenNIDevice(DepthSource):
 
     live = True
     frame_count = None
+    restarts = misfits = 0
+    state_reason = ""
     device: DeviceInfo
 
     def __init__(
@@ -157,10 +159,6 @@ class OpenNIDevice(DepthSource):
     ) -> None:
         self.uri = f"openni:{device_uri}" if device_uri else "openni"
         self.settings = settings or DeviceSettings(nearest=True)
-        self.dropped = 0
-        self.restarts = 0
-        self.misfits = 0
-        self.state_reason = ""
         self._wanted_uri = device_uri
         self.tap = tap
         self._changed = threading.Condition()
@@ -193,8 +191,8 @@ class OpenNIDevice(DepthSource):
         if taken != wanted:
             text = "it does not offer {}x{}@{}; {}x{}@{} is used instead, --mode chooses another"
             notes += (text.format(*wanted, *taken),)
-        notes += (about["colour_trouble"],) if about["colour_trouble"] else ()
-        self.notes = tuple(f"{self.uri}: {note}." for note in notes)
+        for note in (*notes, about["colour_trouble"]):
+            self._note_once(note)
         self._doubt_identity(about)
         self._supervisor = threading.Thread(target=self._supervise, name="openni-supervisor", daemon=True)
         self._supervisor.start()
@@ -379,8 +377,7 @@ class OpenNIDevice(DepthSource):
     def _hand_on(self, frames: list[DepthFrame]) -> None:
         """Frames that are complete go to whoever waits for one."""
         for frame in frames:
-            if self._pairing.trouble:
-                self._note_once(self._pairing.trouble)
+            self._note_once(self._pairing.trouble)
             if self._first is None:
                 self._first = frame.index
             frame = replace(frame, index=frame.index - self._first)
@@ -392,8 +389,9 @@ class OpenNIDevice(DepthSource):
                 self._changed.notify_all()
 
     def _note_once(self, sentence: str) -> None:
+        """Say it, unless it is empty or was said before."""
         note = f"{self.uri}: {sentence}."
-        if note not in self.notes:
+        if sentence and note not in self.notes:
             self.notes += (note,)
 
     def _reopen(self) -> None:

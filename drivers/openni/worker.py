@@ -99,14 +99,9 @@ def devices() -> list[dict[str, Any]]:
     count = ctypes.c_int()
     c_api.oniGetDeviceList(ctypes.byref(infos), ctypes.byref(count))
     found = [
-        {
-            "uri": infos[number].uri.decode(errors="replace"),
-            "vendor": infos[number].vendor.decode(errors="replace"),
-            "name": infos[number].name.decode(errors="replace"),
-            "usb_vendor_id": infos[number].usbVendorId,
-            "usb_product_id": infos[number].usbProductId,
-        }
-        for number in range(count.value)
+        {name: getattr(info, name).decode(errors="replace") for name in ("uri", "vendor", "name")}
+        | {"usb_vendor_id": info.usbVendorId, "usb_product_id": info.usbProductId}
+        for info in infos[: count.value]
     ]
     c_api.oniReleaseDeviceList(infos)
     return found

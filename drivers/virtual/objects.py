@@ -76,8 +76,6 @@ class MeshSource(DepthSource):
         options.done()
         self.uri = uri
         self.fps = 30.0
-        self.live = False
-        self.dropped = 0
         camera = Camera(width, height, focal, focal, width / 2, height / 2)
         points_mm, triangles = place(read_ply(Path(name)), side, camera)
         depth_mm = render(points_mm, triangles, camera, splat)

@@ -77,7 +77,6 @@ class VirtualSource(DepthSource):
         self.uri = f"virtual:{name}"
         self.camera = Camera.kinect(width, height)
         self.fps = FPS
-        self.dropped = 0
         self._scene = SCENES[scene]()
         self._next = 0
         self._start_s: float | None = None
