@@ -107,7 +107,7 @@ def read_sidecar(folder: Path) -> Sidecar:
         raise damaged(path, f"is not valid TOML ({str(error) or 'nested too deep'})", advice) from error
     try:
         schema = entries.pop("schema", SCHEMA)
-        if not isinstance(schema, int) or schema is True or schema > SCHEMA:
+        if not isinstance(schema, int) or isinstance(schema, bool) or schema > SCHEMA:
             raise _WrongEntryError(
                 "schema", schema, f"up to {SCHEMA}; a later version of this program wrote it, use that"
             )
