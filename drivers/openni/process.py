@@ -101,15 +101,8 @@ class Worker:
         self._inbox: queue.SimpleQueue[Message] = queue.SimpleQueue()
         self._reader = threading.Thread(target=self._read, name="openni-reader", daemon=True)
         self._reader.start()
-        start = {
-            "job": job,
-            "library": str(runtime.path),
-            "memory": name,
-            "slots": _SLOTS,
-            "slot_bytes": _SLOT_BYTES,
-            **values,
-        }
-        self._tell(json.dumps(start))
+        shared = {"memory": name, "slots": _SLOTS, "slot_bytes": _SLOT_BYTES}
+        self._tell(json.dumps({"job": job, "library": str(runtime.path), **shared, **values}))
 
     def receive(self, timeout_s: float) -> Message | None:
         """The next message, or None if none comes in time.

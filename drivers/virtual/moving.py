@@ -53,13 +53,8 @@ def chair(b: Builder, time_s: float) -> None:
     b.rod(Material.METAL, (-250.0, 365.0, 1500.0), (-250.0, 700.0, 1500.0), 30)
 
 
-MOVING: dict[str, Callable[[Builder, float], None]] = {
-    "ball": ball,
-    "second-ball": second_ball,
-    "stopping-ball": stopping_ball,
-    "person": person,
-    "chair": chair,
-}
+_MOVING = (ball, second_ball, stopping_ball, person, chair)
+MOVING: dict[str, Callable[[Builder, float], None]] = {each.__name__.replace("_", "-"): each for each in _MOVING}
 """What can move, by name; each adds itself as it stands at a time."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from array import array
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ _SCALARS = {
 """The codes of `struct`, which are NumPy's too."""
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 64 * 1024
+_HEADER_END = re.compile(rb"end_header(\r\n|\r|\n)")
 _LARGEST = 1e100  # of a coordinate: differences and squares still have room
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 
@@ -122,19 +124,12 @@ _Columns = dict[tuple[str, str], _Column]
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
     """Byte order ('' = ascii), elements, and where the body begins."""
-    end = data.find(b"end_header", 0, _HEADER_LIMIT)
-    if end < 0:
+    end = _HEADER_END.search(data, 0, _HEADER_LIMIT)
+    if end is None:
         raise _BadPlyError("its header has no end")
-    start = end + len(b"end_header")
-    if data[start : start + 2] == b"\r\n":
-        start += 2
-    elif data[start : start + 1] in (b"\n", b"\r"):
-        start += 1
-    else:
-        raise _BadPlyError("nothing follows its header")
     order: str | None = None
     elements: list[_Element] = []
-    for line in data[:end].decode("ascii", "replace").splitlines()[1:]:
+    for line in data[: end.start()].decode("ascii", "replace").splitlines()[1:]:
         words = line.split()
         match words:
             case [] | ["comment" | "obj_info", *_]:
@@ -155,7 +150,7 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
                 raise _BadPlyError(f"its header has the line '{line[:80]}'")
     if order is None:
         raise _BadPlyError("its header names no format")
-    return order, elements, start
+    return order, elements, end.end()
 
 
 def _binary(text: bytes, elements: list[_Element]) -> bytes:

@@ -272,17 +272,9 @@ def fire_hose() -> Scene:
         b.ring(Material.CLOTH, (hub[0], hub[1], hub[2] - 8 * (ring % 2)), (0, 0, 1), middle, 29)
     b.rod(Material.PAINT, hub, (hub[0], hub[1], hub[2] - 60), 105)
     b.rod(Material.METAL, (hub[0], hub[1], hub[2] - 60), (hub[0], hub[1], hub[2] - 95), 34)
-    b.chain(
-        Material.CLOTH,
-        [
-            (326, 40, hub[2]),
-            (334, 200, hub[2] - 25),
-            (300, 330, hub[2] - 60),
-            (230, 400, hub[2] - 75),
-            (140, 405, hub[2] - 80),
-        ],
-        29,
-    )
+    z = hub[2]
+    hose: list[Vector] = [(326, 40, z), (334, 200, z - 25), (300, 330, z - 60), (230, 400, z - 75), (140, 405, z - 80)]
+    b.chain(Material.CLOTH, hose, 29)
     b.rod(Material.METAL, (140, 405, hub[2] - 80), (20, 395, hub[2] - 85), 16)
     b.rod(Material.METAL, (20, 395, hub[2] - 85), (-60, 388, hub[2] - 88), 25)
     # The riser with its flanges and the valve wheel.
