@@ -6,26 +6,18 @@ import os
 from collections.abc import Collection
 from pathlib import Path
 
-_KINECT_CAMERA = (0x045E, 0x02AE)
-_KINECT_MOTORS = ((0x045E, 0x02B0), (0x045E, 0x02C2))
-_ORBBEC = 0x2BC5
-_NAMES = {
-    _KINECT_CAMERA: "Kinect for Xbox 360",
-    (0x045E, 0x02BF): "Kinect for Windows",
-    (0x045E, 0x02C4): "Kinect for Xbox One",
-    (0x045E, 0x02D8): "Kinect for Xbox One",
-    (0x1D27, 0x0600): "PrimeSense sensor",  # as built into the ASUS Xtion, too
-    (0x1D27, 0x0601): "PrimeSense sensor",
-    (0x1D27, 0x0609): "PrimeSense sensor",
-    (_ORBBEC, 0): "Orbbec sensor",  # of which there are dozens
-}
-_DRIVERS = {  # OpenNI2's driver for it, and where it comes from
-    "Kinect for Xbox 360": ("FreenectDriver", "build libfreenect's, as the README says"),
-    "Kinect for Windows": ("FreenectDriver", "build libfreenect's, as the README says"),
-    "Kinect for Xbox One": ("freenect2", "build libfreenect2's"),
-    "Orbbec sensor": ("orbbec", "copy liborbbec.so of Orbbec's OpenNI2 SDK beside the others"),
-    "PrimeSense sensor": ("PS1080", "install the runtime again"),
-}
+_KINECT_MOTORS = {(0x045E, 0x02B0), (0x045E, 0x02C2)}
+_PRIMESENSE = {(0x1D27, product) for product in (0x0600, 0x0601, 0x0609)}  # as built into the ASUS Xtion, too
+_ORBBEC = 0x2BC5  # of whose sensors there are dozens
+_LIBFREENECT = "FreenectDriver", "build libfreenect's, as the README says"
+_SENSORS = (
+    ("A Kinect for Xbox 360", {(0x045E, 0x02AE)}, *_LIBFREENECT),
+    ("A Kinect for Windows", {(0x045E, 0x02BF)}, *_LIBFREENECT),
+    ("A Kinect for Xbox One", {(0x045E, 0x02C4), (0x045E, 0x02D8)}, "freenect2", "build libfreenect2's"),
+    ("A PrimeSense sensor", _PRIMESENSE, "PS1080", "install the runtime again"),
+    ("An Orbbec sensor", {(_ORBBEC, 0)}, "orbbec", "copy liborbbec.so of Orbbec's OpenNI2 SDK beside the others"),
+)
+"""Sensors, their numbers on the bus, OpenNI2's driver for them, and where it comes from."""
 
 
 def usb_advice(
@@ -46,20 +38,21 @@ def usb_advice(
         One or two sentences; empty where the bus tells nothing (as on other systems).
     """
     found = _devices(bus, nodes)
-    for number, name in _NAMES.items():
-        if number not in found:
+    for name, numbers, driver, remedy in _SENSORS:
+        opened_by = [found[number] for number in numbers & found.keys()]
+        if not opened_by:
             continue
-        driver, remedy = _DRIVERS[name]
         if not any(driver.lower() in one.lower() for one in drivers):
             having = ", ".join(sorted(drivers)) or "none"
-            return f"A {name} is on the USB bus, but OpenNI2 has no driver for it (it has: {having}): {remedy}."
-        if not os.access(found[number], os.R_OK | os.W_OK):
-            return (
-                f"A {name} is on the USB bus, but you may not use it ({found[number]}): install"
-                " the udev rules of libopenni2-0 or libfreenect, then plug it in again."
-            )
-        return f"A {name} is on the USB bus: close the program that uses it, or plug it in again."
-    if any(motor in found for motor in _KINECT_MOTORS):
+            return f"{name} is on the USB bus, but OpenNI2 has no driver for it (it has: {having}): {remedy}."
+        for node in opened_by:
+            if not os.access(node, os.R_OK | os.W_OK):
+                return (
+                    f"{name} is on the USB bus, but you may not use it ({node}): install"
+                    " the udev rules of libopenni2-0 or libfreenect, then plug it in again."
+                )
+        return f"{name} is on the USB bus: close the program that uses it, or plug it in again."
+    if _KINECT_MOTORS & found.keys():
         return "A Kinect's motor is on the USB bus but not its camera: plug in its power supply."
     return ""
 
