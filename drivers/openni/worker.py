@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import chdir, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,19 +56,16 @@ def initialize(job: dict[str, Any]) -> None:
     As the library's own `initialize` does, but for one file by its full name and with the reason
     kept: what that raises is a list of tuples in a string.
     """
-    before = Path.cwd()
     try:
-        os.chdir(Path(job["library"]).parent)  # where it looks for what belongs to it
-        c_api.load_dll(job["library"])
-        c_api.oniInitialize(c_api.ONI_API_VERSION)
+        with chdir(Path(job["library"]).parent):  # where it looks for what belongs to it
+            c_api.load_dll(job["library"])
+            c_api.oniInitialize(c_api.ONI_API_VERSION)
     except (OpenNIError, OSError) as error:
         raise JobError(
             f"The OpenNI2 runtime {job['library']} cannot be started: {reason(error)}."
             " Install it again, or set OPENNI2_REDIST to another one's folder.",
             kind="RuntimeMissingError",
         ) from error
-    finally:
-        os.chdir(before)
     openni2._openni2_initialized = True
 
 
