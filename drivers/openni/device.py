@@ -145,7 +145,6 @@ class OpenNIDevice(DepthSource):
     """
 
     live = True
-    frame_count = None
     restarts = misfits = 0
     state_reason = ""
     device: DeviceInfo
