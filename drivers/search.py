@@ -7,9 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from selective_depth.drivers.errors import DamagedRecordingError, SourceNotFoundError
-from selective_depth.drivers.folder.images import is_depth_png
-from selective_depth.drivers.folder.layouts import find_layout
-from selective_depth.drivers.folder.sidecar import SIDECAR
+from selective_depth.drivers.folder import SIDECAR, find_layout, is_depth_png
 from selective_depth.drivers.options import parted
 
 FILES = (".oni", ".bag", ".mcap")

@@ -1,5 +1,6 @@
 """`.oni` recordings without OpenNI2: inspected, read, written and repaired."""
 
+from selective_depth.drivers.oni.form import upright
 from selective_depth.drivers.oni.inspection import inspect_oni
 from selective_depth.drivers.oni.reader import OniReader
 from selective_depth.drivers.oni.recorder import OniRecorder, check_place
@@ -15,5 +16,6 @@ __all__ = [
     "check_place",
     "inspect_oni",
     "repair_oni",
+    "upright",
     "write_oni",
 ]

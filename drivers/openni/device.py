@@ -19,7 +19,7 @@ from selective_depth.drivers.errors import (
     SourceTimeoutError,
 )
 from selective_depth.drivers.frame import Camera, DepthFrame
-from selective_depth.drivers.oni.form import upright
+from selective_depth.drivers.oni import upright
 from selective_depth.drivers.openni.clock import Count
 from selective_depth.drivers.openni.pairing import Pairing
 from selective_depth.drivers.openni.process import Message, Worker, camera_of, error_of
