@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
@@ -18,17 +17,13 @@ from selective_depth.app.console.exit_codes import FAILED, OK
 from selective_depth.app.console.output import make_folder
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pipeline import Feed, open_and_tell, say
+from selective_depth.drivers.bag import BagWriter
 from selective_depth.drivers.errors import SourceError
 from selective_depth.drivers.folder import FolderWriter
-from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni import OniReader, OniReport, OniWriter, inspect_oni, repair_oni
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.options import parted
 from selective_depth.drivers.search import FILES
-from selective_depth.drivers.source import DepthSource
-
-if TYPE_CHECKING:
-    from selective_depth.drivers.bag import BagWriter
 
 MOST_PROBLEMS = 20
 LOOK_S = 600.0
@@ -170,38 +165,28 @@ def export(source: str, out: Path, frames: int | None) -> int:
 def _export(source: str, out: Path, frames: int | None, progress: FrameProgress) -> int:
     """Save them; returns how many."""
     ending = out.suffix.lower()
-    recording, to_oni = Path(source).suffix.lower() == ".oni", ending == ".oni"
-    if recording and to_oni and frames is None:
-        count = repair_oni(source, out).readable_frames
-    elif recording and not to_oni and ending not in BAGS:
-        with OniReader(source, salvage=True) as recorded:
-            count = _save(recorded, out, frames, progress)
-    else:
-        with open_and_tell(source) as opened:
-            for note in opened.notes:
-                say(f"note: {note}")
-            if opened.frame_count is None and frames is None:
-                raise UsageError(f"'{source}' never ends; say how many frames to save, as in --frames 100.")
-            count = _save(opened, out, frames, progress)
-    return count
-
-
-def _save(source: DepthSource, out: Path, frames: int | None, progress: FrameProgress) -> int:
-    ending = out.suffix.lower()
-    writer: OniWriter | FolderWriter | BagWriter
-    if ending in BAGS:
-        from selective_depth.drivers.bag import BagWriter
-
-        writer = BagWriter(out)
-    else:
-        writer = (OniWriter if ending == ".oni" else FolderWriter)(out, fps=source.fps)
+    recording = Path(source).suffix.lower() == ".oni"
+    if recording and ending == ".oni" and frames is None:
+        return repair_oni(source, out).readable_frames
+    salvaged = recording and ending not in (".oni", *BAGS)
     count = 0
-    with writer:
-        wanted: islice[DepthFrame] = islice(source, frames)
-        for count, frame in enumerate(wanted, start=1):
-            writer.write(frame)
-            progress.update(count)
+    with OniReader(source, salvage=True) if salvaged else open_and_tell(source) as opened:
+        for note in opened.notes if not salvaged else ():
+            say(f"note: {note}")
+        if opened.frame_count is None and frames is None:
+            raise UsageError(f"'{source}' never ends; say how many frames to save, as in --frames 100.")
+        with _writer(out, opened.fps) as writer:
+            for count, frame in enumerate(islice(opened, frames), start=1):
+                writer.write(frame)
+                progress.update(count)
     return count
+
+
+def _writer(out: Path, fps: float) -> OniWriter | FolderWriter | BagWriter:
+    ending = out.suffix.lower()
+    if ending in BAGS:
+        return BagWriter(out)
+    return OniWriter(out, fps=fps) if ending == ".oni" else FolderWriter(out, fps=fps)
 
 
 def _print_check(report: OniReport) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy.typing as npt
 
 from selective_depth.app.commands.snapshot import nth_frame
 from selective_depth.app.console.exit_codes import OK
-from selective_depth.app.console.output import make_folder, write_image, write_output
+from selective_depth.app.console.output import make_folder, replacing, write_image, write_output
 from selective_depth.app.pictures import palette
 from selective_depth.app.pipeline import FrameResult, say
 from selective_depth.app.pipeline.selecting import selector_of
@@ -87,15 +86,11 @@ def save_samples(path: Path, acquisition: Acquisition) -> None:
     OutputError
         If the file cannot be written.
     """
-    packed = io.BytesIO()
-    np.savez_compressed(
-        packed,
-        uv=acquisition.uv,
-        depth_mm=acquisition.depth_mm,
-        round=acquisition.round,
-        shape=np.array(acquisition.frame_shape, np.int32),
-    )
-    write_output(path, packed.getvalue())
+    shape = np.array(acquisition.frame_shape, np.int32)
+    with replacing(path) as file:
+        np.savez_compressed(
+            file, uv=acquisition.uv, depth_mm=acquisition.depth_mm, round=acquisition.round, shape=shape
+        )
 
 
 def save_model(

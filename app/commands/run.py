@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from selective_depth.app.commands.session import Session, beside
-from selective_depth.app.commands.steering import Steering
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.keys import KEYS, pressed
 from selective_depth.app.console.output import check_output, write_output
-from selective_depth.app.pipeline import is_settings, print_report, say
+from selective_depth.app.pipeline import print_report, say
+from selective_depth.app.pipeline.report import is_settings
 from selective_depth.app.settings import AcquireOptions, Settings
 from selective_depth.drivers.oni import check_place
 
@@ -36,14 +36,19 @@ def watch(uri: str, settings: Settings) -> int:
     kept = (seen.save, seen.record, seen.json, seen.table, seen.save_model, seen.serve, seen.connect)
     if seen.headless and not any(kept):
         say("Nothing is kept of this run but the report below; --save FILE.rrd, --json or --table keeps it.")
-    steering = Steering()
-    session = Session(uri, settings, steering)
-    with pressed(steering.press) as keys:
+    session = Session(uri, settings)
+    code = run_with_keys(session)
+    if seen.json is not None:
+        write_output(seen.json, session.report.to_json(settings))
+    return code
+
+
+def run_with_keys(session: Session) -> int:
+    """Run a session, which keys of the terminal steer, and print its report; returns the exit code."""
+    with pressed(session.steering.press) as keys:
         session.help = KEYS if keys else ""
         code = session.run()
     print_report(session.report)
-    if seen.json is not None:
-        write_output(seen.json, session.report.to_json(settings))
     return code
 
 

@@ -22,21 +22,9 @@ from selective_depth.app.console import interrupt
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pictures import contact_sheet, write_picture
-from selective_depth.app.pipeline import (
-    Feed,
-    FrameResult,
-    Governor,
-    Pipeline,
-    RunReport,
-    SensorNote,
-    figures_of,
-    gain_of,
-    mean_of,
-    open_and_tell,
-    save_settings,
-    say,
-    state_of,
-)
+from selective_depth.app.pipeline import Feed, FrameResult, Governor, Pipeline, SensorNote, figures_of, open_and_tell
+from selective_depth.app.pipeline.feed import state_of
+from selective_depth.app.pipeline.report import RunReport, gain_of, mean_of, save_settings, say
 from selective_depth.app.settings import Settings
 from selective_depth.app.viewer import Viewer, join_command
 from selective_depth.drivers.errors import DeviceLostError, OutputError, SourceTimeoutError
@@ -100,6 +88,10 @@ class Session:
         self._table: FigureTable | None = None
         self._recording: Recording | None = None
         self._unfinished: list[threading.Thread] = []
+        self._source: DepthSource
+        self._pipeline: Pipeline
+        self._viewer: Viewer
+        self._progress: FrameProgress
         self._went_by = 0  # frames that a sensor made while the run was paused
 
     def run(self) -> int:
@@ -121,17 +113,18 @@ class Session:
             _tell(source)
             report.troubles += source.notes
             told = len(source.notes)
-            pipeline = stack.enter_context(Pipeline(self.settings, realtime=source.live))
+            self._source = source
+            self._pipeline = stack.enter_context(Pipeline(self.settings, realtime=source.live))
             if source.live and not self.settings.run.no_governor:
                 self._governor = Governor(self.settings.acquire, 1000 / source.fps)
             limits = self.settings.run.frames, source.frame_count
             frames = min((limit for limit in limits if limit is not None), default=None)  # None: nobody knows
             if seen.table is not None:
                 self._table = stack.enter_context(writing(seen.table, {"source": self._uri}))
-            viewer = self._open_viewer(pipeline, frames)
+            viewer = self._viewer = self._open_viewer(frames)
             try:
-                with interrupt.recognised(), FrameProgress(self._uri, frames, self.help) as progress:
-                    self._flow(source, pipeline, viewer, progress)
+                with interrupt.recognised(), FrameProgress(self._uri, frames, self.help) as self._progress:
+                    self._flow()
                 if viewer.served_url and not sensor and not self.steering.stopped:
                     say("All frames are served; Ctrl-C ends.")
                     threading.Event().wait()
@@ -146,7 +139,7 @@ class Session:
                 report.missed = viewer.dropped
                 report.state = state_of(source)
                 report.dropped = source.dropped - report.dropped_starting - self._went_by
-                report.stages = pipeline.times.summary()
+                report.stages = self._pipeline.times.summary()
                 if self._governor is not None and self._governor.most.said:
                     report.given_up, report.given_up_frames = self._governor.most.said, self._governor.frames
                 self._publish(ended=True)
@@ -167,13 +160,13 @@ class Session:
         again = partial(open_source, self._uri) if play.loop else None
         return PlayedSource(source, again, start=play.start, every=play.every)
 
-    def _open_viewer(self, pipeline: Pipeline, frames: int | None) -> Viewer:
+    def _open_viewer(self, frames: int | None) -> Viewer:
         """Open every place where the run is to be seen, and tell what came of it."""
         spend = self.settings.acquire
         viewer = Viewer(
             self.settings.viewer,
             live=self.report.live,
-            times=pipeline.times,
+            times=self._pipeline.times,
             frames=frames,
             title=f"{Path(self._uri).name} {f'by {spend.by}' if spend.budget else ''}",
             fallback=Path("out", "live.rrd" if self._uri.startswith("openni") else "replay.rrd"),
@@ -185,44 +178,45 @@ class Session:
             say(f"Serving; join with '{join_command(viewer.served_url)}'.")
         return viewer
 
-    def _flow(self, source: DepthSource, pipeline: Pipeline, viewer: Viewer, progress: FrameProgress) -> None:
+    def _tell(self, sentence: str) -> None:
+        """Say something at once, beside the progress and to people who look on."""
+        self._progress.say(sentence)
+        self.steering.news.append(sentence)
+
+    def _hand_on(self, results: Iterable[FrameResult]) -> None:
+        for result in results:
+            self._show(result)
+            self._progress.update(self.report.frames, f"{result.figures['fps']:.0f} frames/s")
+
+    def _flow(self) -> None:
         """Source to pipeline to result to sinks, one frame after the other."""
+        source, pipeline = self._source, self._pipeline
         feed = Feed(source, self.settings.run.frames)
         state, taken, skipped = state_of(source), 0, 0
-
-        def tell(sentence: str) -> None:
-            progress.say(sentence)
-            self.steering.tell(sentence)
-
-        def hand_on(results: Iterable[FrameResult]) -> None:
-            for result in results:
-                self._show(result, source, pipeline, viewer)
-                progress.update(self.report.frames, f"{result.figures['fps']:.0f} frames/s")
-
         self._publish(state=state)
         for read in feed:
-            for sentence in viewer.news():
-                tell(sentence)
+            for sentence in self._viewer.news():
+                self._tell(sentence)
             if self._recording is not None and self._recording.failure:
-                tell(f"Recording ended early: {self._recording.failure}.")
-                self._record(False, source, tell)
+                self._tell(f"Recording ended early: {self._recording.failure}.")
+                self._record(False)
             if read.state != state:
                 state = read.state
-                reason = getattr(source, "state_reason", "")
-                tell(f"sensor {state}{': ' if reason else ''}{reason}")
-                self._publish(state=f"{state}{': ' if reason else ''}{reason}")
+                with_reason = ": ".join(filter(None, (state, getattr(source, "state_reason", ""))))
+                self._tell(f"sensor {with_reason}")
+                self._publish(state=with_reason)
             if read.frame is None:
-                viewer.show(SensorNote(state))
-                hand_on(pipeline.rest())
-                self._obey(source, pipeline, tell)
+                self._viewer.show(SensorNote(state))
+                self._hand_on(pipeline.rest())
+                self._obey()
                 continue
             if not self._ready_s:
-                shown = self._get_ready(read.frame, source, pipeline, viewer)
+                shown = self._get_ready(read.frame)
                 taken += shown
                 if shown:
                     continue
                 if self.settings.viewer.record is not None:
-                    self._record(True, source, tell, read.frame)
+                    self._record(True, read.frame)
             if not taken and self._recording is not None and not self._recording.has(read.frame):
                 feed.frames = None if feed.frames is None else feed.frames + 1  # what is shown is recorded
                 continue
@@ -233,24 +227,24 @@ class Session:
                 if self._governor.note(source.dropped - skipped, read.read_ms):
                     pipeline.ease(self._governor.eased)
                     left_out = self._governor.eased.said
-                    tell(f"To keep up: {left_out}." if left_out else "Keeping up with all of it again.")
+                    self._tell(f"To keep up: {left_out}." if left_out else "Keeping up with all of it again.")
                 skipped = source.dropped
             pipeline.begin(read.frame, state=state, read_ms=read.read_ms)
-            hand_on(pipeline.finished())
-            self._obey(source, pipeline, tell)
+            self._hand_on(pipeline.finished())
+            self._obey()
             if self.steering.paused:
-                hand_on(pipeline.rest())
-                skipped += self._wait(source, pipeline, tell)
+                self._hand_on(pipeline.rest())
+                skipped += self._wait()
             if self.steering.stopped:
                 break
         if feed.damage is not None:
             self.report.troubles.append(str(feed.damage))
             self._code = FAILED
-        hand_on(pipeline.rest())
+        self._hand_on(pipeline.rest())
 
-    def _wait(self, source: DepthSource, pipeline: Pipeline, tell: Callable[[str], None]) -> int:
+    def _wait(self) -> int:
         """Wait until the run goes on; what a sensor makes meanwhile goes by, uncounted. Returns how much that was."""
-        before = source.dropped
+        source, before = self._source, self._source.dropped
         while self.steering.paused and not self.steering.stopped:
             interrupt.check()
             if source.live:
@@ -258,12 +252,12 @@ class Session:
                     source.read(WAIT_S)
             else:
                 time.sleep(WAIT_S)
-            self._obey(source, pipeline, tell)
+            self._obey()
         went_by = source.dropped - before
         self._went_by += went_by
         return went_by
 
-    def _obey(self, source: DepthSource, pipeline: Pipeline, tell: Callable[[str], None]) -> None:
+    def _obey(self) -> None:
         """Do what was asked for since the last frame."""
         for asked in self.steering.take():
             meant = self.steering.meant(asked[1]) if asked[0] == "key" else asked
@@ -275,29 +269,27 @@ class Session:
             elif name == "stop":
                 self.steering.stopped = True
             elif name == "reset":
-                pipeline.forget()
+                self._pipeline.forget()
             elif name in ("recording", "snapshot"):
                 try:
-                    self._record(value, source, tell) if name == "recording" else self._take_picture(tell)
+                    self._record(value) if name == "recording" else self._take_picture()
                 except OutputError as error:
-                    tell(str(error))
+                    self._tell(str(error))
             else:
-                self._change(changed(self.settings, name, value), pipeline)
+                self._change(changed(self.settings, name, value))
             self._publish()  # for the next key, and for those who look on
 
-    def _change(self, settings: Settings, pipeline: Pipeline) -> None:
+    def _change(self, settings: Settings) -> None:
         if settings.acquire != self.settings.acquire:
-            pipeline.adopt(settings)
+            self._pipeline.adopt(settings)
             self.report.begin_anew()
             self._recent.clear()
             if self._governor is not None:
                 self._governor.restart(settings.acquire)
-                pipeline.ease(self._governor.eased)
+                self._pipeline.ease(self._governor.eased)
         self.settings = settings
 
-    def _record(
-        self, on: bool, source: DepthSource, tell: Callable[[str], None], first: DepthFrame | None = None
-    ) -> None:
+    def _record(self, on: bool, first: DepthFrame | None = None) -> None:
         """Begin to record, under the name that was given for the first time, or stop.
 
         A recording's frame that was read already is `first`; a sensor's is too old by now.
@@ -306,13 +298,17 @@ class Session:
             seen = self.settings.viewer
             named = seen.record if seen.record not in self.report.recorded else None
             path = named or unused("record", ".oni")
-            self._recording = Recording(source, path, seen.overwrite)
-            if first is not None and not source.live:
+            self._recording = Recording(self._source, path, seen.overwrite)
+            if first is not None and not self._source.live:
                 self._recording.take(first)
             self.report.recorded[path] = (0, 0.0)
-            tell(f"Recording to {path}.")
-        elif not on and self._recording is not None:
-            recording, self._recording = self._recording, None
+            self._tell(f"Recording to {path}.")
+        elif not on:
+            self._stop_recording(self._tell)
+
+    def _stop_recording(self, tell: Callable[[str], None]) -> None:
+        recording, self._recording = self._recording, None
+        if recording is not None:
 
             def done(sentence: str) -> None:
                 self.report.recorded[recording.path] = recording.frames, recording.seconds
@@ -322,13 +318,12 @@ class Session:
 
     def _finish_recordings(self) -> None:
         """Finish what is recorded to the last frame, however long that takes."""
-        if self._recording is not None:
-            self._record(False, self._recording.source, self.report.troubles.append)
+        self._stop_recording(self.report.troubles.append)
         for thread in self._unfinished:
             thread.join()
         self.report.written += [path for path, (frames, _) in self.report.recorded.items() if frames]
 
-    def _take_picture(self, tell: Callable[[str], None]) -> None:
+    def _take_picture(self) -> None:
         """A sheet of the last frame, drawn beside the run."""
         last = self.last
         if last is None:
@@ -339,27 +334,27 @@ class Session:
             try:
                 write_picture(path, contact_sheet((title, last)))
             except OutputError as error:
-                tell(str(error))
+                self._tell(str(error))
             else:
-                tell(f"Wrote {path}.")
+                self._tell(f"Wrote {path}.")
 
         self._unfinished.append(threading.Thread(target=draw, name="drawing a picture"))
         self._unfinished[-1].start()
 
-    def _get_ready(self, frame: DepthFrame, source: DepthSource, pipeline: Pipeline, viewer: Viewer) -> bool:
+    def _get_ready(self, frame: DepthFrame) -> bool:
         """Compile, fill tables and caches with the first frame; whether that is shown already.
 
         A sensor's is: when all is ready it is too old to be made again, and whatever takes its time when
         something is logged for the first time is behind the run then.
         """
-        began_s = time.monotonic()
+        source, pipeline, viewer, began_s = self._source, self._pipeline, self._viewer, time.monotonic()
         with waiting("Compiling for this machine; the next run starts at once"):
             first = self.prepare(pipeline, frame)
             viewer.wait_ready()
         shown = source.live and self.settings.viewer.record is None
         if shown:
             self._start_clock()
-            self._show(replace(first, state=state_of(source)), source, pipeline, viewer)
+            self._show(replace(first, state=state_of(source)))
             viewer.wait_taken()
             pipeline.times.clear()
         gc.collect()
@@ -373,7 +368,7 @@ class Session:
         self._recent_s.clear()
         self._recent_s.append(self._ready_s)
 
-    def _show(self, result: FrameResult, source: DepthSource, pipeline: Pipeline, viewer: Viewer) -> None:
+    def _show(self, result: FrameResult) -> None:
         """Add what only the run knows of a result, and hand it to report and viewer."""
         now_s = time.monotonic()
         self._recent_s.append(now_s)
@@ -382,10 +377,10 @@ class Session:
         result.figures.update(
             figures,
             fps=(len(self._recent_s) - 1) / (now_s - self._recent_s[0]),
-            dropped_sensor=source.dropped - self._went_by,
-            dropped_viewer=sum(viewer.dropped.values()),
+            dropped_sensor=self._source.dropped - self._went_by,
+            dropped_viewer=sum(self._viewer.dropped.values()),
         )
-        result.stages_ms.update(pipeline.times.last_ms() | result.stages_ms)
+        result.stages_ms.update(self._pipeline.times.last_ms() | result.stages_ms)
         told = replace(
             result,
             gain=gain_of({name: mean_of(each[name] for each in self._recent) for name in figures}),
@@ -396,12 +391,12 @@ class Session:
         self.report.seconds = now_s - self._ready_s
         self.report.processor_s = time.process_time() - self._ready_cpu_s
         self.last = told
-        viewer.show(told)
+        self._viewer.show(told)
         if self._table is not None:
             self._table.add(figure_row(told))
         self._publish(
             state=told.state, gain=told.gain, given_up=told.given_up, fps=told.figures["fps"],
-            skipped=source.dropped - self.report.dropped_starting - self._went_by,
+            skipped=self._source.dropped - self.report.dropped_starting - self._went_by,
         )  # fmt: skip
 
     def _publish(self, **known: Any) -> None:
@@ -414,7 +409,7 @@ class Session:
             paused=self.steering.paused,
             recording=self._recording is not None,
             frames=self.report.frames,
-            news=self.steering.news,
+            news=tuple(self.steering.news),
             **known,
         )
 

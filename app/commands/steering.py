@@ -39,10 +39,7 @@ _ALLOWED: dict[str, Callable[[Any], object]] = {
     "hide": lambda x: set(x) <= set(LAYERS),
     "paused": lambda x: isinstance(x, bool),
     "recording": lambda x: isinstance(x, bool),
-    "snapshot": lambda x: x is None,
-    "reset": lambda x: x is None,
-    "stop": lambda x: x is None,
-}
+} | dict.fromkeys(("snapshot", "reset", "stop"), lambda x: x is None)
 """What may be asked for, and which values: no names of files, no code."""
 
 
@@ -91,13 +88,15 @@ class Steering:
         Whether the run is to end.
     status : Status or None
         How it stands; None before it has begun.
+    news : deque of str
+        The last sentences, for people who look on.
     """
 
     def __init__(self) -> None:
         self.paused = self.stopped = False
         self.status: Status | None = None
         self._asked: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
-        self._news: deque[str] = deque(maxlen=NEWS)
+        self.news: deque[str] = deque(maxlen=NEWS)
 
     def ask(self, name: str, value: Any = None) -> None:
         """Ask for a change: see `Status` and ``_ALLOWED``.
@@ -145,15 +144,6 @@ class Steering:
     def take(self) -> list[tuple[str, Any]]:
         """What was asked for since the last call."""
         return [self._asked.get() for _ in range(self._asked.qsize())]
-
-    def tell(self, sentence: str) -> None:
-        """Keep a sentence for people who look on."""
-        self._news.append(sentence)
-
-    @property
-    def news(self) -> tuple[str, ...]:
-        """The last sentences."""
-        return tuple(self._news)
 
 
 def changed(settings: Settings, name: str, value: Any) -> Settings:

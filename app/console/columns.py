@@ -28,9 +28,9 @@ def print_table(
         Of `rich.table.Table`: a title, a caption.
     """
     rows = list(rows)
-    table = Table(box=None, pad_edge=False, show_header=bool(heads), title_justify="left", caption_justify="left")
-    for name, value in options.items():
-        setattr(table, name, value)
+    table = Table(
+        box=None, pad_edge=False, show_header=bool(heads), title_justify="left", caption_justify="left", **options
+    )
     for at in range(max(map(len, [heads, *rows]))):
         side: Literal["left", "right"] = "left" if justify[min(at, len(justify) - 1)] == "l" else "right"
         whole = at == 0 and bool(heads) and justify != "l"  # the name of a row of figures

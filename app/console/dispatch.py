@@ -11,17 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from selective_depth.app.console import interrupt
-from selective_depth.app.console.command import (
-    PROGRAM,
-    SOURCE_OPTIONS,
-    Example,
-    completion,
-    find,
-    overview,
-    parse_with_settings,
-    with_source_options,
-)
+from selective_depth.app.console import command, interrupt
 from selective_depth.app.console.errors import AppError, UsageError
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, MISUSED, OK
 
@@ -29,7 +19,7 @@ NARROWEST = 40
 """Columns; in fewer, the parser's help can take for ever to find its line breaks."""
 
 
-def run(arguments: Sequence[str], examples: Sequence[Example]) -> int:
+def run(arguments: Sequence[str], examples: Sequence[command.Example]) -> int:
     """Run a command line.
 
     Parameters
@@ -63,7 +53,7 @@ def run(arguments: Sequence[str], examples: Sequence[Example]) -> int:
         return MISUSED if isinstance(error, UsageError) else FAILED
 
 
-def _dispatch(words: list[str], verbose: bool, examples: Sequence[Example]) -> int:
+def _dispatch(words: list[str], verbose: bool, examples: Sequence[command.Example]) -> int:
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(message)s")
     # The viewer's SDK logs in its own way to the terminal; its warnings are told in ours.
     os.environ.setdefault("RUST_LOG", "warn" if verbose else "off")
@@ -71,18 +61,18 @@ def _dispatch(words: list[str], verbose: bool, examples: Sequence[Example]) -> i
         os.environ["COLUMNS"] = str(NARROWEST)
     first, typed = (words or ["--help"])[0], words[1:]
     if first in ("-h", "--help", "help"):
-        print(overview(examples))
+        print(command.overview(examples))
     elif first == "--version":
         print(_versions())
     elif first == "--completion":
-        print(completion(typed[0] if typed else ""))
+        print(command.completion(typed[0] if typed else ""))
     else:
         file = _value(typed, "--settings", "a file: --settings FILE.toml")
         preset = _value(typed, "--preset", "a name: --preset paper")
         settings = None if file is None else Path(file)
-        given = {each: _value(typed, f"--{each}", "a value") for each in SOURCE_OPTIONS}
-        call = parse_with_settings(find(first), typed, settings, preset)
-        return with_source_options(call, {k: v for k, v in given.items() if v is not None})() or OK
+        given = {each: _value(typed, f"--{each}", "a value") for each in command.SOURCE_OPTIONS}
+        call = command.parse_with_settings(command.find(first), typed, settings, preset)
+        return command.with_source_options(call, {k: v for k, v in given.items() if v is not None})() or OK
     return OK
 
 
@@ -114,7 +104,7 @@ def _versions() -> str:
         runtime = f"OpenNI2 runtime {runtime_version()}"
     except SourceError as error:
         runtime = f"no OpenNI2 runtime: {error}"
-    return f"{PROGRAM} {__version__}\n{runtime}"
+    return f"{command.PROGRAM} {__version__}\n{runtime}"
 
 
 def sentence_of(error: Exception) -> str:
@@ -134,4 +124,4 @@ def sentence_of(error: Exception) -> str:
 
 def _say(words: str) -> None:
     with suppress(OSError):  # the terminal may be closed
-        print(f"{PROGRAM}: {words}", file=sys.stderr)
+        print(f"{command.PROGRAM}: {words}", file=sys.stderr)

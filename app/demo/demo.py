@@ -7,13 +7,13 @@ import secrets
 import webbrowser
 from dataclasses import replace
 
+from selective_depth.app.commands.run import run_with_keys
 from selective_depth.app.commands.samples import bundled_recording
 from selective_depth.app.commands.session import Session
 from selective_depth.app.commands.steering import Steering
 from selective_depth.app.console.errors import UsageError
-from selective_depth.app.console.keys import KEYS, pressed
 from selective_depth.app.console.progress import waiting
-from selective_depth.app.pipeline import FrameResult, Pipeline, print_report, say
+from selective_depth.app.pipeline import FrameResult, Pipeline, say
 from selective_depth.app.settings import DemoOptions, Settings
 from selective_depth.app.viewer import own_address, serving_web_viewer, stream_port
 from selective_depth.drivers.errors import SourceError
@@ -85,11 +85,7 @@ def run_demo(source: str | None, options: DemoOptions, settings: Settings) -> in
                 return pipeline.warm_up(frame)
 
             session.prepare = prepare
-            with pressed(steering.press) as keys:
-                session.help = KEYS if keys else ""
-                code = session.run()
-    print_report(session.report)
-    return code
+            return run_with_keys(session)
 
 
 def _default_source() -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,7 +17,7 @@ from selective_depth.app.console.errors import ViewerError
 from selective_depth.app.demo.guard import Guard
 from selective_depth.app.pictures.palette import STATE_COLOURS
 from selective_depth.app.pipeline.selecting import NAMES
-from selective_depth.app.settings import LAYERS, LAYOUTS
+from selective_depth.app.settings import LAYERS, LAYOUTS, Layer
 from selective_depth.app.viewer import free_port, web_address
 
 LOOK_S = 0.2
@@ -27,7 +27,7 @@ HELD_S = 0.7
 RECONNECT_S = 60.0
 """For how long a page that is not heard of is kept: a tablet sleeps, a browser paints the viewer in software."""
 START_S = 10.0
-TITLE, DOT = "Selective depth", "fiber_manual_record"
+TITLE = "Selective depth"
 Show = Callable[[Any], Any]
 LABELS = {
     "auto": "best there is",
@@ -173,9 +173,8 @@ class _Page:
         slider = ui.slider(min=0, max=20, step=0.5, value=0).props("dense")
         self._control(slider, "budget", lambda s: round(200 * s.acquire.budget) / 2, lambda percent: percent / 100)
         self._text(lambda s: f"Rounds: {s.acquire.rounds}", "text-sm", "rounds-text")
-        self._control(
-            ui.slider(min=1, max=16, step=1, value=1).props("dense"), "rounds", lambda s: s.acquire.rounds, int
-        )
+        rounds = ui.slider(min=1, max=16, step=1, value=1).props("dense")
+        self._control(rounds, "rounds", lambda s: s.acquire.rounds, int)
         by = ui.select(LABELS, label="Shots chosen by", value="auto").classes("w-full").props("dense outlined")
         self._control(by, "by", lambda s: s.acquire.by if s.acquire.by in NAMES else None)
         memory = ui.switch("Memory (camera stands still)").props("dense")
@@ -184,40 +183,35 @@ class _Page:
         self._control(layout, "layout", lambda s: s.viewer.layout)
         shown = ui.select(list(LAYERS), label="Layers", multiple=True, value=list(LAYERS))
         shown.classes("w-full").props("dense outlined")
-        self._control(
-            shown,
-            "hide",
-            lambda s: [layer for layer in LAYERS if layer not in s.viewer.hide],
-            lambda chosen: tuple(layer for layer in LAYERS if layer not in chosen),
-        )
+        self._control(shown, "hide", lambda s: list(_others(s.viewer.hide)), _others)
 
     def _buttons(self) -> None:
-        ask = self._steering.ask
+        with ui.row().classes("w-full gap-2"):
+            self._toggle("paused", ("Pause", "pause"), ("Go on", "play_arrow"), lambda s: s.paused)
+            self._button("reset", "Reset", "restart_alt", lambda: self._steering.ask("reset"))
+        with ui.row().classes("w-full gap-2"):
+            self._toggle("recording", ("Record", "fiber_manual_record"), ("Stop", "stop"), lambda s: s.recording)
+            self._button("snapshot", "Picture", "photo_camera", lambda: self._steering.ask("snapshot"))
 
-        def button(name: str, icon: str, text: str, act: Callable[[], None]) -> ui.button:
-            made = ui.button(text, icon=icon, on_click=act).props(f'dense no-caps outline data-name="{name}"')
-            return made.classes("grow")
+    def _button(self, name: str, text: str, icon: str, act: Callable[[], None]) -> ui.button:
+        made = ui.button(text, icon=icon, on_click=act).props(f'dense no-caps outline data-name="{name}"')
+        return made.classes("grow")
 
-        def now(of: Callable[[Status], bool], name: str) -> None:
+    def _toggle(self, name: str, off: tuple[str, str], on: tuple[str, str], of: Callable[[Status], bool]) -> None:
+        """A button for what is off or on, with the text and the icon of what a click does."""
+
+        def click() -> None:
             if self._steering.status is not None:
-                ask(name, not of(self._steering.status))
+                self._steering.ask(name, not of(self._steering.status))
 
-        with ui.row().classes("w-full gap-2"):
-            pause = button("paused", "pause", "Pause", lambda: now(lambda s: s.paused, "paused"))
-            button("reset", "restart_alt", "Reset", lambda: ask("reset"))
-        with ui.row().classes("w-full gap-2"):
-            record = button(
-                "recording", "fiber_manual_record", "Record", lambda: now(lambda s: s.recording, "recording")
-            )
-            button("snapshot", "photo_camera", "Picture", lambda: ask("snapshot"))
+        button = self._button(name, *off, click)
 
-        def name_them(status: Status) -> None:
-            pause.set_text("Go on" if status.paused else "Pause")
-            pause.set_icon("play_arrow" if status.paused else "pause")
-            record.set_text("Stop" if status.recording else "Record")
-            record.set_icon("stop" if status.recording else DOT)
+        def follow(status: Status) -> None:
+            text, icon = on if of(status) else off
+            button.set_text(text)
+            button.set_icon(icon)
 
-        self._synced.append(name_them)
+        self._synced.append(follow)
 
     def _news(self) -> None:
         self._text(lambda s: "\n".join(s.news), "text-xs text-gray-400 whitespace-pre-line break-words", "news")
@@ -239,3 +233,8 @@ class _Page:
 
         ui.switch("Viewer", value=seen, on_change=lambda event: show(event.value)).props('dense data-name="seen"')
         show(seen)
+
+
+def _others(layers: Sequence[Layer]) -> tuple[Layer, ...]:
+    """The layers that are not among these: what is hidden where these are shown, and the other way round."""
+    return tuple(layer for layer in LAYERS if layer not in layers)

@@ -1,18 +1,10 @@
 """One frame's way: a frame in; seeds, both selectors, the samples and the model out."""
 
-from selective_depth.app.pipeline.feed import Feed, Read, open_and_tell, state_of
+from selective_depth.app.pipeline.feed import Feed, open_and_tell
 from selective_depth.app.pipeline.figures import figures_of
 from selective_depth.app.pipeline.governor import Governor
 from selective_depth.app.pipeline.pipeline import Pipeline
-from selective_depth.app.pipeline.report import (
-    RunReport,
-    gain_of,
-    is_settings,
-    mean_of,
-    print_report,
-    save_settings,
-    say,
-)
+from selective_depth.app.pipeline.report import RunReport, print_report, say
 from selective_depth.app.pipeline.result import FrameResult, Model, SensorNote
 from selective_depth.app.pipeline.timing import STAGES, StageSummary, StageTimes
 
@@ -23,18 +15,12 @@ __all__ = [
     "Governor",
     "Model",
     "Pipeline",
-    "Read",
     "RunReport",
     "SensorNote",
     "StageSummary",
     "StageTimes",
     "figures_of",
-    "gain_of",
-    "is_settings",
-    "mean_of",
     "open_and_tell",
     "print_report",
-    "save_settings",
     "say",
-    "state_of",
 ]

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
+import runpy
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.settings import Settings
@@ -75,15 +73,10 @@ def _of_ones_own(by: str) -> Selector | Worth:
         )
     if not path.is_file():
         raise UsageError(f"--by is '{by}', but there is no file '{file}'; check its name.")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None  # it ends in .py
-    module = importlib.util.module_from_spec(spec)
-    sys.modules.setdefault(path.stem, module)  # for dataclasses, which look their module up
     try:
-        spec.loader.exec_module(module)
+        found = runpy.run_path(file).get(name)
     except Exception as error:
         raise UsageError(f"--by is '{by}', but '{file}' fails: {type(error).__name__}: {error}.") from error
-    found: Any = getattr(module, name, None)
     if isinstance(found, type):  # a class: its instances are the selectors
         found = found()
     if not (callable(found) or isinstance(found, Selector)):
@@ -91,4 +84,4 @@ def _of_ones_own(by: str) -> Selector | Worth:
             f"--by is '{by}', but '{file}' has no function or selector '{name}'; define"
             f" {name}(samples), which returns a worth for every pixel."
         )
-    return found  # type: ignore[no-any-return]
+    return found

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 KEPT = 1 << 16
 """Durations kept per stage: at 30 fps the last 36 minutes, 256 KB."""
@@ -28,6 +30,28 @@ class StageSummary:
     count: int
 
 
+@dataclass
+class _Durations:
+    """Those of one stage, in milliseconds: the last `KEPT` of them in a ring."""
+
+    ring: npt.NDArray[np.float32] = field(default_factory=lambda: np.full(KEPT, np.nan, np.float32))
+    count: int = 0
+    highest: float = 0.0
+    last: float = math.nan
+
+    def add(self, duration_ms: float) -> None:
+        """Add one."""
+        self.ring[self.count % KEPT] = duration_ms
+        self.count += 1
+        self.highest = max(self.highest, duration_ms)
+        self.last = duration_ms
+
+    def summary(self) -> StageSummary:
+        """Median and 99th percentile of those kept, maximum of all."""
+        p50, p99 = np.percentile(self.ring[: self.count], (50, 99))
+        return StageSummary(float(p50), float(p99), self.highest, self.count)
+
+
 class StageTimes:
     """Durations of named stages; safe to use from several threads.
 
@@ -35,17 +59,13 @@ class StageTimes:
     """
 
     def __init__(self) -> None:
-        self._rings: dict[str, np.ndarray] = {}
-        self._counts: dict[str, int] = {}
-        self._highest: dict[str, float] = {}
-        self._last: dict[str, float] = {}
+        self._stages: defaultdict[str, _Durations] = defaultdict(_Durations)
         self._lock = threading.Lock()
 
     def clear(self) -> None:
         """Forget everything."""
         with self._lock:
-            for each in (self._rings, self._counts, self._highest, self._last):
-                each.clear()
+            self._stages.clear()
 
     @contextmanager
     def stage(self, name: str, own_ms: dict[str, float] | None = None) -> Iterator[None]:
@@ -64,28 +84,15 @@ class StageTimes:
     def add(self, name: str, duration_ms: float) -> None:
         """Add one duration."""
         with self._lock:
-            if name not in self._rings:
-                self._rings[name] = np.full(KEPT, np.nan, np.float32)
-                self._counts[name] = 0
-                self._highest[name] = 0.0
-            self._rings[name][self._counts[name] % KEPT] = duration_ms
-            self._counts[name] += 1
-            self._highest[name] = max(self._highest[name], duration_ms)
-            self._last[name] = duration_ms
+            self._stages[name].add(duration_ms)
 
     def last_ms(self) -> dict[str, float]:
         """Latest duration of each of the `STAGES`; NaN of one that has not run."""
         with self._lock:
-            return {name: self._last.get(name, math.nan) for name in STAGES}
+            return {name: self._stages[name].last if name in self._stages else math.nan for name in STAGES}
 
     def summary(self) -> dict[str, StageSummary]:
         """Median, 99th percentile and maximum of every stage, in their order."""
         with self._lock:
-            names = [name for name in STAGES if name in self._rings]
-            names += [name for name in self._rings if name not in STAGES]
-            return {name: self._summarise(name) for name in names}
-
-    def _summarise(self, name: str) -> StageSummary:
-        durations = self._rings[name][: self._counts[name]]
-        p50, p99 = np.percentile(durations, (50, 99))
-        return StageSummary(float(p50), float(p99), self._highest[name], self._counts[name])
+            names = [name for name in STAGES if name in self._stages]
+            return {name: self._stages[name].summary() for name in dict.fromkeys([*names, *self._stages])}

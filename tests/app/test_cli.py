@@ -29,7 +29,7 @@ from selective_depth.app.commands import run
 from selective_depth.app.console import dispatch
 from selective_depth.app.console.command import COMMANDS, SHELLS, parse
 from selective_depth.app.console.settings_file import to_toml
-from selective_depth.app.pipeline import save_settings
+from selective_depth.app.pipeline.report import save_settings
 from selective_depth.app.settings import MOST_ROUNDS, GasOptions, PlayOptions, RunOptions, Settings, ViewerOptions
 from selective_depth.app.viewer import sinks
 from selective_depth.drivers.errors import OutputError
@@ -564,7 +564,7 @@ def test_unexpected_error_asks_for_debug(capsys: pytest.CaptureFixture[str], mon
     def fail(*_: object) -> int:
         raise KeyError("surprise")
 
-    monkeypatch.setattr(dispatch, "parse_with_settings", fail)
+    monkeypatch.setattr(dispatch.command, "parse_with_settings", fail)
     code, line = refuse(capsys, "replay", "x")
     assert code == 1
     assert "KeyError" in line
