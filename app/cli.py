@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import arg
 
@@ -51,17 +51,9 @@ Page = Annotated[PanelOptions, arg(name="")]
 Selectors = Annotated[SelectorOptions, arg(name="")]
 DEFAULTS, LIVE, SELECTORS, PAGE, BATCH = Settings(), LiveSettings(), SelectorOptions(), PanelOptions(), BatchOptions()
 MODEL, SHOWN, DEMO = AcquireOptions(budget=0.05, rounds=8), AcquireOptions(budget=0.05, rounds=4), DemoOptions()
-SCENES = ("virtual:workstation", "virtual:ball", "virtual:firehose")
 
 
-@command(
-    "Watch",
-    (f"{PROGRAM} replay", "the recording that comes with the program"),
-    (f"{PROGRAM} replay walk.oni", "every frame of a recording, in the viewer"),
-    (f"{PROGRAM} replay frames/ --headless --save out.rrd", "a folder of PNG frames, to a file"),
-    (f"{PROGRAM} replay virtual:firehose --budget 0.05 --rounds 4", "and measure 5 % more"),
-    (f"{PROGRAM} replay walk.oni --realtime --serve", "as live, for viewers elsewhere to join"),
-)
+@command("Watch")
 def replay(source: SourceOrSample = None, /, settings: Options = DEFAULTS) -> int:
     """Replay a recording through both selectors.
 
@@ -71,6 +63,19 @@ def replay(source: SourceOrSample = None, /, settings: Options = DEFAULTS) -> in
         An .oni file, a folder of PNG frames, a .ply object or virtual:SCENE; else the sample.
     settings : Settings
         All options.
+
+    Examples
+    --------
+    selective-depth replay
+        the recording that comes with the program
+    selective-depth replay walk.oni
+        every frame of a recording, in the viewer
+    selective-depth replay frames/ --headless --save out.rrd
+        a folder of PNG frames, to a file
+    selective-depth replay virtual:firehose --budget 0.05 --rounds 4
+        and measure 5 % more
+    selective-depth replay walk.oni --realtime --serve
+        as live, for viewers elsewhere to join
     """
     from selective_depth.app.commands.run import watch
     from selective_depth.app.commands.samples import bundled_recording
@@ -78,12 +83,7 @@ def replay(source: SourceOrSample = None, /, settings: Options = DEFAULTS) -> in
     return watch(bundled_recording() if source is None else source, settings)
 
 
-@command(
-    "Watch",
-    (f"{PROGRAM} live", "the sensor that is plugged in, in the viewer"),
-    (f"{PROGRAM} live --headless --save demo.rrd --frames 300", "ten seconds, to a file"),
-    (f"{PROGRAM} live --serve --serve-address 0.0.0.0:9876", "for viewers on other machines"),
-)
+@command("Watch")
 def live(device: Annotated[str, optional("DEVICE")] = "", /, settings: LiveOptions = LIVE) -> int:
     """Watch a sensor through both selectors; end with Ctrl-C.
 
@@ -93,18 +93,22 @@ def live(device: Annotated[str, optional("DEVICE")] = "", /, settings: LiveOptio
         Its address as 'selective-depth devices' shows it; by default the only one there is.
     settings : Settings
         All options.
+
+    Examples
+    --------
+    selective-depth live
+        the sensor that is plugged in, in the viewer
+    selective-depth live --headless --save demo.rrd --frames 300
+        ten seconds, to a file
+    selective-depth live --serve --serve-address 0.0.0.0:9876
+        for viewers on other machines
     """
     from selective_depth.app.commands.run import watch
 
     return watch(f"openni:{device}" if device else "openni", settings)
 
 
-@command(
-    "Watch",
-    (f"{PROGRAM} demo", "the sensor that is plugged in, else a bundled recording in a loop"),
-    (f"{PROGRAM} demo walk.oni --budget 2%", "a recording, in a loop"),
-    (f"{PROGRAM} demo --share", "for a tablet in the same room too"),
-)
+@command("Watch")
 def demo(
     source: SourceOrSample = None,
     /,
@@ -126,6 +130,15 @@ def demo(
         Where the page is.
     selectors, acquire, play
         What it begins with.
+
+    Examples
+    --------
+    selective-depth demo
+        the sensor that is plugged in, else a bundled recording in a loop
+    selective-depth demo walk.oni --budget 2%
+        a recording, in a loop
+    selective-depth demo --share
+        for a tablet in the same room too
     """
     from selective_depth.app.demo import run_demo
 
@@ -133,12 +146,7 @@ def demo(
     return run_demo(source, options, Settings(**vars(selectors), acquire=acquire, play=play, viewer=seen))
 
 
-@command(
-    "Sensors",
-    (f"{PROGRAM} record walk.oni", "until Ctrl-C"),
-    (f"{PROGRAM} record walk.oni --seconds 10", "ten seconds"),
-    (f"{PROGRAM} record walk.oni 1d27/0609@1/3 --frames 300", "from one of several sensors"),
-)
+@command("Sensors")
 def record(
     out: Annotated[Path, arg(metavar="OUT.oni")],
     device: Annotated[str, optional("DEVICE")] = "",
@@ -161,26 +169,36 @@ def record(
         Stop after this time; by default with Ctrl-C.
     overwrite : bool
         Replace a file of that name.
+
+    Examples
+    --------
+    selective-depth record walk.oni
+        until Ctrl-C
+    selective-depth record walk.oni --seconds 10
+        ten seconds
+    selective-depth record walk.oni 1d27/0609@1/3 --frames 300
+        from one of several sensors
     """
     from selective_depth.app.commands.sensors import record_sensor
 
     return record_sensor(out, device, frames=frames, seconds=seconds, overwrite=overwrite)
 
 
-@command("Sensors", (f"{PROGRAM} devices", "what is plugged in, or what is missing"))
+@command("Sensors")
 def devices() -> int:
-    """List the sensors that OpenNI2 finds, or say what is missing and what to install."""
+    """List the sensors that OpenNI2 finds, or say what is missing and what to install.
+
+    Examples
+    --------
+    selective-depth devices
+        what is plugged in, or what is missing
+    """
     from selective_depth.app.commands.sensors import print_devices
 
     return print_devices()
 
 
-@command(
-    "Files",
-    (f"{PROGRAM} check walk.oni", "what is wrong with it and where, how much is readable"),
-    (f"{PROGRAM} check walk.oni --repair whole.oni", "and save what is readable"),
-    (f"{PROGRAM} check archive/ 'day2/*.oni'", "every recording in there, in a table"),
-)
+@command("Files")
 def check(
     sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
@@ -197,19 +215,22 @@ def check(
         Write what is readable of one .oni file to this new file, which OpenNI2 replays.
     timeout : float
         Look at an .oni file for so long at most.
+
+    Examples
+    --------
+    selective-depth check walk.oni
+        what is wrong with it and where, how much is readable
+    selective-depth check walk.oni --repair whole.oni
+        and save what is readable
+    selective-depth check archive/ 'day2/*.oni'
+        every recording in there, in a table
     """
     from selective_depth.app.commands.files import check as look
 
     return look(sources, repair=repair, timeout_s=timeout)
 
 
-@command(
-    "Files",
-    (f"{PROGRAM} export walk.oni frames/", "as 16-bit PNG files; all that is readable"),
-    (f"{PROGRAM} export frames/ walk.oni", "an .oni file out of PNG files"),
-    (f"{PROGRAM} export virtual:ball ball.oni --frames 90", "of any source"),
-    (f"{PROGRAM} export archive/ walk.oni out/", "of several: a folder of PNG files each"),
-)
+@command("Files")
 def export(paths: Annotated[tuple[str, ...], optional("SOURCE... OUT")], /, frames: Limit = None) -> int:
     """Save a source's frames as PNG files, an .oni file or a ROS 2 bag; needs no OpenNI2.
 
@@ -221,19 +242,24 @@ def export(paths: Annotated[tuple[str, ...], optional("SOURCE... OUT")], /, fram
         a folder that holds some, OUT gets a folder of PNG files for each.
     frames : int
         Stop after this many frames of each.
+
+    Examples
+    --------
+    selective-depth export walk.oni frames/
+        as 16-bit PNG files; all that is readable
+    selective-depth export frames/ walk.oni
+        an .oni file out of PNG files
+    selective-depth export virtual:ball ball.oni --frames 90
+        of any source
+    selective-depth export archive/ walk.oni out/
+        of several: a folder of PNG files each
     """
     from selective_depth.app.commands.files import export_all
 
     return export_all(paths, frames)
 
 
-@command(
-    "Files",
-    (f"{PROGRAM} batch archive/ --out results", "every recording in it: a table each, and a summary"),
-    (f"{PROGRAM} batch 'day1/*.oni' scans/ --out results --budget 5% --models", "and what a budget buys"),
-    (f"{PROGRAM} batch - --out results", "a list of recordings on standard input"),
-    (f"{PROGRAM} batch archive/ --out results --scheduler tcp://host:8786", "on a Dask cluster"),
-)
+@command("Files")
 def batch(
     sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
@@ -256,13 +282,24 @@ def batch(
         What is kept, and who does the work.
     selectors, acquire
         Options of the selectors.
+
+    Examples
+    --------
+    selective-depth batch archive/ --out results
+        every recording in it: a table each, and a summary
+    selective-depth batch 'day1/*.oni' scans/ --out results --budget 5% --models
+        and what a budget buys
+    selective-depth batch - --out results
+        a list of recordings on standard input
+    selective-depth batch archive/ --out results --scheduler tcp://host:8786
+        on a Dask cluster
     """
     from selective_depth.app.commands.batch import run_batch
 
     return run_batch(sources, out, options, Settings(**vars(selectors), acquire=acquire))
 
 
-@command("Files", (f"{PROGRAM} model frames/ model --frame 30 --budget 0.05", "a cloud, its depth, its samples"))
+@command("Files")
 def model(
     source: Source,
     out: Annotated[Path, arg(metavar="DIR")],
@@ -283,6 +320,11 @@ def model(
         Which frame, from 0.
     selectors, acquire
         Options of the acquisition and of the selector that drives it.
+
+    Examples
+    --------
+    selective-depth model frames/ model --frame 30 --budget 0.05
+        a cloud, its depth, its samples
     """
     from selective_depth.app.commands.model import model_frame
 
@@ -290,12 +332,7 @@ def model(
     return model_frame(source, out, frame, settings)
 
 
-@command(
-    "Pictures",
-    (f"{PROGRAM} screenshot out.rrd out.png", "the viewer on a recording that --save wrote"),
-    (f"{PROGRAM} screenshot out.rrd out.png --time 12.5 --size 1280x720", "after so many seconds"),
-    (f"{PROGRAM} screenshot out.rrd space.png --view space", "one view alone"),
-)
+@command("Pictures")
 def screenshot(
     recording: Annotated[Path, arg(metavar="FILE.rrd")],
     picture: Annotated[Path, arg(metavar="FILE.png")],
@@ -321,19 +358,22 @@ def screenshot(
         Show one view alone: its title, or a part of it.
     size : tuple of int
         Width and height of the viewer in pixels.
+
+    Examples
+    --------
+    selective-depth screenshot out.rrd out.png
+        the viewer on a recording that --save wrote
+    selective-depth screenshot out.rrd out.png --time 12.5 --size 1280x720
+        after so many seconds
+    selective-depth screenshot out.rrd space.png --view space
+        one view alone
     """
     from selective_depth.app.commands.snapshot import take_screenshot
 
     return take_screenshot(recording, picture, frame, time, view, size)
 
 
-@command(
-    "Pictures",
-    (f"{PROGRAM} snapshot walk.oni --frame 30", "one frame, all panels, no viewer needed"),
-    (f"{PROGRAM} snapshot virtual:workstation virtual:ball virtual:firehose", "the paper's Fig. 5"),
-    (f"{PROGRAM} snapshot frames/ --budget 0.05 --out pictures", "with what was acquired"),
-    (f"{PROGRAM} snapshot walk.oni --out panels --format pdf --panel-width 3.5", "for a paper's column"),
-)
+@command("Pictures")
 def snapshot(
     sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
@@ -357,78 +397,22 @@ def snapshot(
         Options of the selectors.
     page
         The page.
+
+    Examples
+    --------
+    selective-depth snapshot walk.oni --frame 30
+        one frame, all panels, no viewer needed
+    selective-depth snapshot virtual:workstation virtual:ball virtual:firehose
+        the paper's Fig. 5
+    selective-depth snapshot frames/ --budget 0.05 --out pictures
+        with what was acquired
+    selective-depth snapshot walk.oni --out panels --format pdf --panel-width 3.5
+        for a paper's column
     """
     from selective_depth.app.commands.snapshot import draw_snapshot
 
     settings = Settings(**vars(selectors), acquire=acquire)
     return draw_snapshot(sources, frame, out, settings, page)
-
-
-@command(
-    "Pictures",
-    (f"{PROGRAM} figure 5", "both selectors on the three scenes, to figure-5.png"),
-    (f"{PROGRAM} figure 1 bunny.ply --out fig1.pdf", "neural gas by epochs, of your own object"),
-)
-def figure(
-    number: Annotated[Literal[1, 2, 4, 5], arg(metavar="1|2|4|5")],
-    sources: Annotated[tuple[str, ...], optional("SOURCE...")] = (),
-    /,
-    out: Annotated[Path | None, optional("FILE")] = None,
-    save: Annotated[Path | None, optional("FILE.rrd")] = None,
-    frame: Natural = 0,
-    selectors: Selectors = SELECTORS,
-    page: Page = PAGE,
-) -> int:
-    """Make a figure of the paper, on the virtual scenes or on any source.
-
-    1: neural gas by training length. 2: by density of the first scan. 4: the scenes. 5: what
-    both selectors find in them.
-
-    Parameters
-    ----------
-    number : int
-        The paper's number of it.
-    sources : tuple of str
-        As for replay; by default the three virtual scenes, of which 1 and 2 take the first.
-    out : Path
-        The picture to make, .png, .webp, .pdf or .svg, or a folder for it and every panel; by
-        default figure-N.png.
-    save : Path
-        Write the trainings of figure 1 to a Rerun recording as well, by epoch.
-    frame : int
-        Which frame of each source, from 0.
-    selectors
-        Their options.
-    page
-        The page.
-    """
-    from selective_depth.app.commands.paper import draw_figure
-
-    settings = Settings(**vars(selectors))
-    return draw_figure(number, sources or SCENES, out, frame, settings, page, save)
-
-
-@command("Pictures", (f"{PROGRAM} table 1", "computing times on the three scenes, as in the paper"))
-def table(
-    number: Annotated[Literal[1], arg(metavar="1")] = 1,
-    sources: Annotated[tuple[str, ...], optional("SOURCE...")] = (),
-    /,
-    frame: Natural = 0,
-) -> int:
-    """Time neural gas and the improvement map, with the paper's options; takes half a minute.
-
-    Parameters
-    ----------
-    number : int
-        The paper's number of it.
-    sources : tuple of str
-        As for replay; by default the three virtual scenes.
-    frame : int
-        Which frame of each source, from 0.
-    """
-    from selective_depth.app.commands.paper import print_times
-
-    return print_times(sources or SCENES, frame)
 
 
 # Declared here, to be listed after those above.

@@ -2,7 +2,7 @@
 
 A command is added in `cli.py`, nowhere else::
 
-    @command("Files", ("selective-depth check walk.oni", "what is wrong with it, and where"))
+    @command("Files")
     def check(file: Annotated[Path, arg(metavar="FILE")], /) -> int | None:
         \"\"\"Say whether a recording is whole.
 
@@ -10,6 +10,11 @@ A command is added in `cli.py`, nowhere else::
         ----------
         file : Path
             The recording.
+
+        Examples
+        --------
+        selective-depth check walk.oni
+            what is wrong with it, and where
         \"\"\"
         from selective_depth.drivers.oni.inspection import inspect_oni  # heavy: after parsing
         ...
@@ -73,13 +78,10 @@ class Command:
         The function; its signature is the command line.
     group : str
         The heading under which it is listed.
-    examples : tuple of (str, str)
-        Command lines, each with what it does; they come first in the help.
     """
 
     run: Run
     group: str
-    examples: tuple[Example, ...]
 
     @property
     def name(self) -> str:
@@ -89,13 +91,23 @@ class Command:
     @property
     def summary(self) -> str:
         """First line of the function's docstring."""
-        return (inspect.getdoc(self.run) or "").partition("\n")[0]
+        return self._sections[0].partition("\n")[0]
+
+    @property
+    def examples(self) -> list[Example]:
+        """Command lines, each with what it does: the last section of the function's docstring."""
+        lines = [line.strip() for line in self._sections[-1].splitlines()]
+        return list(zip(lines[::2], lines[1::2], strict=True))
+
+    @property
+    def _sections(self) -> list[str]:
+        """The docstring's text, its parameters, its examples."""
+        return re.split(r"\n(?:Parameters|Examples)\n-+\n", inspect.getdoc(self.run) or "")
 
     @property
     def description(self) -> str:
         """Summary, examples, and the rest of the docstring but for its parameters."""
-        text = (inspect.getdoc(self.run) or "").partition("\nParameters\n")[0]
-        summary, _, rest = text.partition("\n")
+        summary, _, rest = self._sections[0].partition("\n")
         lines = [summary, "", "Examples:", *_example_lines(self.examples), *rest.rstrip().split("\n")]
         if set(SOURCES) & set(inspect.signature(self.run).parameters):
             lines += ["", *_source_help()]
@@ -105,11 +117,11 @@ class Command:
 COMMANDS: dict[str, Command] = {}
 
 
-def command(group: str, *examples: Example) -> Callable[[Run], Run]:
-    """Declare a function as a command of the program, in a group, with examples."""
+def command(group: str) -> Callable[[Run], Run]:
+    """Declare a function as a command of the program, in a group."""
 
     def declare(run: Run) -> Run:
-        made = Command(run, group, examples)
+        made = Command(run, group)
         COMMANDS[made.name] = made
         return run
 
