@@ -46,7 +46,11 @@ def check(sources: Sequence[str], *, repair: Path | None, timeout_s: float) -> i
     if len(found) == len(sources) == 1 and not Path(found[0].source).is_dir():
         return check_file(Path(parted(sources[0])[0]), repair=repair, timeout_s=timeout_s)
     if repair is not None or not found:
-        raise UsageError("--repair mends one .oni file." if found else "no recording was named; give files or folders.")
+        raise UsageError(
+            "--repair takes one .oni file; name that file alone."
+            if found
+            else "no recording was named; give files or folders."
+        )
     return _several("Checking", found, lambda each: _look(each.source, timeout_s))
 
 
@@ -76,7 +80,7 @@ def _look(source: str, timeout_s: float) -> tuple[int, str]:
         return report.readable_frames, "" if report.complete else _verdict(report)
     with open_source(source) as opened:
         if opened.frame_count is None:
-            raise SourceError(f"'{source}' never ends: there is nothing to check.")
+            raise SourceError(f"'{source}' never ends, so it cannot be checked; record some of it first.")
         feed = Feed(opened)
         frames = sum(1 for _ in feed)
         return frames, str(feed.damage or opened.damage or "" if frames else f"'{source}' holds no frame")
@@ -194,7 +198,7 @@ def _print_check(report: OniReport) -> None:
     console.print(str(report.path), soft_wrap=True)
     rows = [("size", f"{report.size_bytes:,}", "bytes")]
     if report.tail_bytes:
-        rows.append(("of it unused, at the end", f"{report.tail_bytes:,}", "bytes"))
+        rows.append(("unused at its end", f"{report.tail_bytes:,}", "bytes"))
     if report.version:
         rows.append(("version of the format", report.version, ""))
     for node in report.nodes:
@@ -211,7 +215,7 @@ def _print_check(report: OniReport) -> None:
     for problem in report.problems[:MOST_PROBLEMS]:
         console.print(str(problem), soft_wrap=True, markup=False)
     if len(report.problems) > MOST_PROBLEMS:
-        console.print(f"and {len(report.problems) - MOST_PROBLEMS} problems more")
+        console.print(f"and {len(report.problems) - MOST_PROBLEMS} more problems")
     console.print(_verdict(report), soft_wrap=True, markup=False)
 
 

@@ -80,7 +80,7 @@ def check(settings: Settings) -> None:
 
 
 def _check_save(path: Path, overwrite: bool) -> None:
-    """Refuse a name that is none of a Rerun recording, or that would replace what is there."""
+    """Refuse a name that is not a Rerun recording's, or that would replace what is there."""
     if path.suffix.lower() != ".rrd":
         raise UsageError(f"--save is '{path}'; it must end in .rrd, as Rerun recordings do.")
     try:

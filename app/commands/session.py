@@ -118,7 +118,7 @@ class Session:
             if source.live and not self.settings.run.no_governor:
                 self._governor = Governor(self.settings.acquire, 1000 / source.fps)
             limits = self.settings.run.frames, source.frame_count
-            frames = min((limit for limit in limits if limit is not None), default=None)  # None: nobody knows
+            frames = min((limit for limit in limits if limit is not None), default=None)  # None: unknown
             if seen.table is not None:
                 self._table = stack.enter_context(writing(seen.table, {"source": self._uri}))
             viewer = self._viewer = self._open_viewer(frames)
@@ -300,7 +300,7 @@ class Session:
             path = named or unused("record", ".oni")
             self._recording = Recording(self._source, path, seen.overwrite)
             if first is not None and not self._source.live:
-                self._recording.take(first)
+                self._recording.write(first)
             self.report.recorded[path] = (0, 0.0)
             self._tell(f"Recording to {path}.")
         elif not on:

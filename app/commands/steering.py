@@ -22,7 +22,7 @@ from selective_depth.drivers.oni import OniRecorder
 from selective_depth.drivers.source import DepthSource
 
 BUDGETS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
-"""Steps of the keys, as shares of the pixels."""
+"""What the keys go through, as shares of the pixels."""
 MEMORY_BUDGET = 0.02
 """What a memory spends a frame where nothing was spent before."""
 FOLDER = Path("out")
@@ -120,7 +120,7 @@ class Steering:
         self._asked.put(("key", key))
 
     def meant(self, key: str) -> tuple[str, Any] | None:
-        """What a key stands for as things are now, when it is its turn; None of a key that is none."""
+        """What a key stands for as things are now, when it is its turn; None for any other key."""
         status = self.status
         if status is None:
             return None
@@ -157,18 +157,18 @@ def changed(settings: Settings, name: str, value: Any) -> Settings:
 
 
 def unused(stem: str, ending: str) -> Path:
-    """A new name in `FOLDER`, which is made if need be, that says the time.
+    """A new name in `FOLDER`, which is made if need be; it holds the time.
 
     Raises
     ------
     OutputError
-        If there is no making it.
+        If it cannot be made.
     """
     make_folder(FOLDER)
     return FOLDER / f"{stem}-{datetime.now():%Y%m%d-%H%M%S-%f}{ending}"  # to the microsecond, so that none is taken
 
 
-class Recording:
+class Recording(OniRecorder):
     """Frames of a source on their way into an .oni file, for as long as this lives.
 
     Parameters
@@ -192,40 +192,30 @@ class Recording:
     """
 
     def __init__(self, source: DepthSource, path: Path, overwrite: bool = False) -> None:
-        self.path, self.source = path, source
+        super().__init__(path, fps=source.fps, overwrite=overwrite)
         self.seconds = 0.0
+        self._source = source
         self._began_s = time.monotonic()
-        self._recorder = OniRecorder(path, fps=source.fps, overwrite=overwrite)
         self._began_us: int | None = None
-        source.tap = self.take
+        source.tap = self.write
 
-    def take(self, frame: DepthFrame) -> None:
-        """Put a frame in."""
+    def write(self, frame: DepthFrame) -> None:
+        """Hand a frame over; it is on the disk a little later."""
         if self._began_us is None:
             self._began_us = frame.timestamp_us
-        self._recorder.write(frame)
+        super().write(frame)
 
     def has(self, frame: DepthFrame) -> bool:
         """Whether a frame of the source is in it: those before it began are not."""
         return self._began_us is not None and frame.timestamp_us >= self._began_us
 
-    @property
-    def frames(self) -> int:
-        """How many are in the file."""
-        return self._recorder.frames
-
-    @property
-    def failure(self) -> str:
-        """What ended it early; empty if nothing did."""
-        return self._recorder.failure
-
     def stop_beside(self, tell: Callable[[str], None]) -> threading.Thread:
         """Take no more frames, and finish the file in a thread of its own; `tell` gets a sentence when that is done."""
-        self.source.tap = None
+        self._source.tap = None
         self.seconds = time.monotonic() - self._began_s
 
         def finish() -> None:
-            tell(self._recorder.close() or f"Recorded {self.frames:,} frames to {self.path}.")
+            tell(self.close() or f"Recorded {self.frames:,} frames to {self.path}.")
 
         thread = threading.Thread(target=finish, name="finishing a recording")
         thread.start()

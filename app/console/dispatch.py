@@ -16,7 +16,7 @@ from selective_depth.app.console.errors import AppError, UsageError
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, MISUSED, OK
 
 NARROWEST = 40
-"""Columns; in fewer, the parser's help can take for ever to find its line breaks."""
+"""Columns; in fewer, the parser's help can take forever to find its line breaks."""
 
 
 def run(arguments: Sequence[str], examples: Sequence[command.Example]) -> int:

@@ -92,7 +92,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """Open a file that takes its name, and the older file's place, when it is whole on the disk.
 
     It is written under another name beside it and renamed at the end, so that a full disk, an
-    error or a killed process leaves the older file as it was. What is no regular file, such as
+    error or a killed process leaves the older file as it was. Anything but a regular file, such as
     ``/dev/stdout`` or a named pipe, is written directly.
 
     Raises

@@ -62,7 +62,7 @@ class FrameProgress:
     what : str
         What is running.
     total : int or None
-        Frames in all; None where nobody knows.
+        Frames in all; None where that is not known.
     hint : str, optional
         Below the bar on a terminal: the keys that there are.
     """

@@ -23,15 +23,15 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 """What `--preset` sets, by name: "paper" is section V's."""
 
 SCHEMA = 1
-"""Version of a settings file; one without it is of before there were any."""
+"""Version of a settings file; a file without it was written before there were any."""
 LARGEST_BYTES = 1 << 20
-"""No settings file is as large as this."""
+"""Settings files are smaller than this."""
 
 
 def to_toml(settings: Settings, *heading: str) -> str:
     """Settings as TOML that `--settings` reads back, under a heading of comments.
 
-    Where the results went, as ``save``, is none of the settings: another run with them must not
+    Where the results went, as ``save``, is not among the settings: another run with them must not
     replace these. How a recording was played is left out where it was just played, for a sensor is not.
     """
     tables = dataclasses.asdict(settings)
@@ -110,7 +110,7 @@ def preset_arguments(name: str, defaults: dict[str, Any]) -> list[str]:
         If there is no such preset, or the command has none of its options.
     """
     if name not in PRESETS:
-        raise UsageError(f"--preset is '{name}'; there is {' and '.join(PRESETS)}.")
+        raise UsageError(f"--preset is '{name}'; it must be {' or '.join(PRESETS)}.")
     taken = {*defaults, *(key for value in defaults.values() for key in getattr(value, "__dict__", ()))}
     sections = {key: value for key, value in PRESETS[name].items() if key in taken}
     if not sections:
@@ -135,7 +135,8 @@ def _read(path: Path) -> dict[str, Any]:
         schema = entries.pop("schema", SCHEMA)
         if type(schema) is not int or schema > SCHEMA:
             raise UsageError(
-                f"settings file '{path}' has schema {schema!r:.40}; up to {SCHEMA} is known, a later version wrote it."
+                f"settings file '{path}' has schema {schema!r:.40}, but this version reads up to {SCHEMA};"
+                " a later version wrote it."
             )
         return entries
     except FileNotFoundError:

@@ -52,7 +52,7 @@ def write_table(path: Path, table: pa.Table, version: int) -> None:
 
 
 def metadata_of(path: Path) -> dict[str, str] | None:
-    """What a Parquet file says of itself; None where there is none, or none that can be read."""
+    """What a Parquet file says of itself; None where it is missing or cannot be read."""
     try:
         said = pq.read_metadata(path).metadata or {}
     except (OSError, pa.ArrowException):

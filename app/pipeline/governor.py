@@ -40,8 +40,8 @@ ALL = Eased()
 """Everything that was asked for."""
 
 
-def steps(options: AcquireOptions) -> tuple[Eased, ...]:
-    """What is given up, one after the other: the model of every second frame, rounds, the gas of every second.
+def levels(options: AcquireOptions) -> tuple[Eased, ...]:
+    """What is made at each level: everything, then no model of every second frame, fewer rounds, gas in every second.
 
     A memory makes its model on the way and spends its rounds as it must: there only the gas is left.
     """
@@ -87,7 +87,7 @@ class Governor:
 
     def restart(self, options: AcquireOptions) -> None:
         """Begin anew with what is asked for now."""
-        self._steps = steps(options)
+        self._levels = levels(options)
         self._level = self._seen = self._skipped = self._quiet = 0
         self._waited_ms = 0.0
         self._tried = False
@@ -95,7 +95,7 @@ class Governor:
     @property
     def eased(self) -> Eased:
         """What is made now."""
-        return self._steps[self._level]
+        return self._levels[self._level]
 
     def note(self, skipped: int, waited_ms: float) -> bool:
         """Take in how a frame came; whether something changes.
@@ -103,7 +103,7 @@ class Governor:
         Parameters
         ----------
         skipped : int
-            Frames that nobody had time for since the one before.
+            Frames skipped since the one before.
         waited_ms : float
             How long this one was waited for.
         """
@@ -125,7 +125,7 @@ class Governor:
         if by > 0 and self._tried:
             self._patience = min(2 * self._patience, PATIENCE[1])
         self._tried = by < 0
-        before, self._level = self._level, min(max(self._level + by, 0), len(self._steps) - 1)
+        before, self._level = self._level, min(max(self._level + by, 0), len(self._levels) - 1)
         self._quiet = 0
         self._begin_window()
         self.most = max(self.most, self.eased, key=lambda each: len(each.said))

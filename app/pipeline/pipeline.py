@@ -182,12 +182,12 @@ class Pipeline:
         asked, stages_ms = self._asked, {"read": read_ms}
         if math.isfinite(read_ms):
             self.times.add("read", read_ms)
-        step: TemporalStep | None = None
+        memory: TemporalStep | None = None
         modelling: Future[tuple[Acquisition | None, Model | None]]
         if asked.settings.acquire.memory == "still":
-            step = self._remember(asked, frame, stages_ms)
-            seeds = step.seeds
-            modelling = self._beside.submit(self._told_by, step, frame, stages_ms)
+            memory = self._remember(asked, frame, stages_ms)
+            seeds = memory.seeds
+            modelling = self._beside.submit(self._told_by, memory, frame, stages_ms)
         else:
             with self.times.stage("seeds", stages_ms):
                 seeds = self._seeds(frame)
@@ -210,17 +210,8 @@ class Pipeline:
                 model = self._beside_even(asked, frame, model, len(acquisition.uv))
             loop_ms = begun_ms + (time.perf_counter() - start_s) * 1000
             self.times.add("loop", loop_ms)
-            return FrameResult(
-                frame=frame,
-                seeds=seeds,
-                regions=regions,
-                improvement=improvement,
-                acquisition=acquisition,
-                model=model,
-                memory=step,
-                state=state,
-                stages_ms=stages_ms | {"loop": loop_ms},
-            )
+            stages_ms["loop"] = loop_ms
+            return FrameResult(frame, seeds, regions, improvement, acquisition, model, memory, state, stages_ms)
 
         self._under_way.append(finish)
 

@@ -128,7 +128,7 @@ class RunReport:
         self.means.clear()
 
     def to_json(self, settings: Settings) -> str:
-        """The report and the settings as JSON; what nobody knows is null."""
+        """The report and the settings as JSON; what is not known is null."""
         content = vars(self) | {
             "schema": SCHEMA,
             "gain": self.gain,
@@ -142,7 +142,7 @@ class RunReport:
 
 
 def gain_of(figures: Mapping[str, float]) -> str:
-    """What selecting was worth, in a line, by the figures of `figures_of` or their means; empty if nobody knows.
+    """What selecting was worth, in a line, by the figures of `figures_of` or their means; empty if that is not known.
 
     With a memory it is the error to the truth, where that is known, as the even lattice's is then.
     """
@@ -167,30 +167,29 @@ def print_report(report: RunReport) -> None:
     """Print the table of a run on standard output; without colours if that is no terminal."""
     console, means = Console(highlight=False), report.means
     console.print(report.source, soft_wrap=True)  # a table would break a long path
-    rows = [("frames", f"{report.frames:,}", ""), ("whole loop", f"{report.fps:.1f}", "frames/s")]
-    if report.live:
-        rows.append(("skipped while starting", f"{report.dropped_starting:,}", "frames"))
-        rows.append(("skipped to keep up", f"{report.dropped:,}", "frames"))
-        rows.append(("sensor at the end", report.state, ""))
-    rows += [(f"not shown in {name}", f"{missed:,}", "frames") for name, missed in report.missed.items()]
-    rows.append(("samples with depth", f"{means['samples'].value:,.0f}", "per frame"))
-    if report.by:
-        rows.append(("shots chosen by", report.by, ""))
-    for title, name, unit in (
-        ("quantisation error", "quantisation_error_mm", "mm"),
-        ("model RMSE", "rmse_mm", "mm to the frame"),
-        ("", "truth_rmse_mm", "mm to the truth"),
-        ("whole frame", "sensor_rmse_mm", "mm to the truth"),
-    ):
-        if means[name].count:
-            rows.append((title, f"{means[name].value:.1f}", unit))
-    if report.changes:
-        rows.append(("options changed", f"{report.changes:,}", "times; the figures are since the last"))
-    if report.given_up:
-        rows.append(("left out to keep up", f"{report.given_up_frames:,}", f"frames: {report.given_up}"))
-    if means["known_percent"].count:
-        rows.append(("pixels known", f"{means['known_percent'].value:.1f}%", "on average"))
-    print_table(rows, justify="lrl")
+
+    def mean(name: str, digits: int = 1) -> str:
+        return f"{means[name].value:,.{digits}f}" if means[name].count else ""
+
+    known = mean("known_percent")
+    rows = [
+        ("frames", f"{report.frames:,}", ""),
+        ("whole loop", f"{report.fps:.1f}", "frames/s"),
+        ("skipped while starting", f"{report.dropped_starting:,}" if report.live else "", "frames"),
+        ("skipped to keep up", f"{report.dropped:,}" if report.live else "", "frames"),
+        ("sensor at the end", report.state if report.live else "", ""),
+        *((f"not shown in {name}", f"{missed:,}", "frames") for name, missed in report.missed.items()),
+        ("samples with depth", mean("samples", 0), "per frame"),
+        ("shots chosen by", report.by, ""),
+        ("quantisation error", mean("quantisation_error_mm"), "mm"),
+        ("model RMSE", mean("rmse_mm"), "mm to the frame"),
+        ("", mean("truth_rmse_mm"), "mm to the truth"),
+        ("whole frame", mean("sensor_rmse_mm"), "mm to the truth"),
+        ("options changed", f"{report.changes:,}" if report.changes else "", "times; the figures are since the last"),
+        ("left out to keep up", f"{report.given_up_frames:,}" if report.given_up else "", f"frames: {report.given_up}"),
+        ("pixels known", f"{known}%" if known else "", "on average"),
+    ]
+    print_table([row for row in rows if row[1]], justify="lrl")  # what is not known is left out
     if report.gain:
         console.print(f"\n{report.gain}", style="bold")
     console.print()

@@ -104,7 +104,7 @@ class FrameResult:
         Running figures by name: a run adds those of `figures_of`, its rate and its drops before it
         hands the result on.
     gain : str
-        What selecting was worth over the last second, in a line; empty where nobody knows.
+        What selecting was worth over the last second, in a line; empty where that is not known.
     given_up : str
         What the governor leaves out, in a few words; empty if it is nothing.
     look : ViewerOptions or None

@@ -1,4 +1,4 @@
-"""Which selector drives the shots: by name, or a function of one's own from a file."""
+"""Which selector drives the shots: by name, or the user's own, from a file."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ def selector_of(settings: Settings, threads: int | None) -> Selector | Worth:
         "neural-gas-edges": lambda: LongEdgeSelector(gas_of(settings, threads)),
         "even": EvenSelector,
     }
-    return makers[by]() if by in makers else _of_ones_own(by)
+    return makers[by]() if by in makers else _users_own(by)
 
 
-def _of_ones_own(by: str) -> Selector | Worth:
+def _users_own(by: str) -> Selector | Worth:
     """A selector out of a Python file, which is run for it."""
     file, colon, name = by.rpartition(":")
     path = Path(file)

@@ -199,7 +199,7 @@ def test_fish_completes_commands_options_choices_and_files(tmp_path: Path) -> No
         (["replay", "x", "--near-mm", "900", "--far-mm", "900"], "--far-mm is 900"),
         (["replay", "x", "--settings"], "--settings needs a file"),
         (["replay", "x", "--preset"], "--preset needs a name"),
-        (["replay", "x", "--preset=pepper"], "--preset is 'pepper'; there is paper"),
+        (["replay", "x", "--preset=pepper"], "--preset is 'pepper'; it must be paper"),
         (["check", "x.oni", "--preset", "paper"], "sets none of this command's options"),
         (["replay", "x", "--settings", "no.toml"], "'no.toml' does not exist"),
         (["record"], "OUT.oni"),

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from selective_depth.app.pipeline.governor import ALL, PATIENCE, WINDOW, Governor, steps
+from selective_depth.app.pipeline.governor import ALL, PATIENCE, WINDOW, Governor, levels
 from selective_depth.app.settings import AcquireOptions
 
 PERIOD_MS = 1000 / 30
@@ -14,7 +14,7 @@ FULL = AcquireOptions(budget=0.05, rounds=4)
 
 
 def said(options: AcquireOptions) -> list[str]:
-    return [each.said for each in steps(options)]
+    return [each.said for each in levels(options)]
 
 
 def test_the_order_is_the_one_that_is_documented() -> None:
@@ -24,7 +24,7 @@ def test_the_order_is_the_one_that_is_documented() -> None:
         "model every 2nd frame, 2 rounds instead of 4",
         "model every 2nd frame, 2 rounds instead of 4, neural gas every 2nd frame",
     ]
-    assert [(each.model_every, min(each.rounds, 4), each.gas_every) for each in steps(FULL)] == [
+    assert [(each.model_every, min(each.rounds, 4), each.gas_every) for each in levels(FULL)] == [
         (1, 4, 1), (2, 4, 1), (2, 2, 1), (2, 2, 2),
     ]  # fmt: skip
 
@@ -49,7 +49,7 @@ class Machine:
         self.levels: list[int] = []
 
     def run(self, frames: int) -> None:
-        ladder = steps(FULL)
+        ladder = levels(FULL)
         for _ in range(frames):
             level = ladder.index(self.governor.eased)
             self.lag_ms += self.needs_ms[level] - PERIOD_MS
@@ -72,7 +72,7 @@ def test_a_slow_machine_goes_as_far_as_it_must() -> None:
     machine = Machine((60, 45, 32, 20))
     machine.run(2000)
     assert machine.levels[-1] == 2
-    assert machine.governor.most == steps(FULL)[2]
+    assert machine.governor.most == levels(FULL)[2]
 
 
 def test_it_never_goes_below_the_last_step() -> None:

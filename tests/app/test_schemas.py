@@ -47,7 +47,7 @@ def test_what_is_written_is_of_the_present_version() -> None:
 def test_later_settings_are_refused(schema: str, tmp_path: Path) -> None:
     file = tmp_path / "settings.toml"
     file.write_text(f"schema = {schema}\nbudget = 0.05\n")
-    with pytest.raises(UsageError, match=r"has schema .*; up to 1 is known, a later version wrote it"):
+    with pytest.raises(UsageError, match=r"has schema .*, but this version reads up to 1; a later version wrote it"):
         settings_arguments(file, {})
 
 
