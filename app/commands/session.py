@@ -84,7 +84,7 @@ class Session:
         self._ready_s = self._ready_cpu_s = 0.0
         self._recent_s: deque[float] = deque(maxlen=31)
         self._recent: deque[dict[str, float]] = deque(maxlen=30)
-        self._governor: Governor | None = None
+        self._governor: Governor
         self._table: FigureTable | None = None
         self._recording: Recording | None = None
         self._unfinished: list[threading.Thread] = []
@@ -111,12 +111,10 @@ class Session:
                 source = stack.enter_context(RealtimeSource(source, speed))
             report.live = source.live
             _tell(source)
-            report.troubles += source.notes
-            told = len(source.notes)
             self._source = source
             self._pipeline = stack.enter_context(Pipeline(self.settings, realtime=source.live))
-            if source.live and not self.settings.run.no_governor:
-                self._governor = Governor(self.settings.acquire, 1000 / source.fps)
+            governed = source.live and not self.settings.run.no_governor
+            self._governor = Governor(self.settings.acquire, 1000 / source.fps if governed else None)
             limits = self.settings.run.frames, source.frame_count
             frames = min((limit for limit in limits if limit is not None), default=None)  # None: unknown
             if seen.table is not None:
@@ -135,13 +133,12 @@ class Session:
                 if viewer.file_failed and self._code == OK:
                     self._code = FAILED
                 self._finish_recordings()
-                report.troubles += source.notes[told:]  # what came up on the way
+                report.troubles = [*source.notes, *report.troubles]
                 report.missed = viewer.dropped
                 report.state = state_of(source)
                 report.dropped = source.dropped - report.dropped_starting - self._went_by
                 report.stages = self._pipeline.times.summary()
-                if self._governor is not None and self._governor.most.said:
-                    report.given_up, report.given_up_frames = self._governor.most.said, self._governor.frames
+                report.given_up, report.given_up_frames = self._governor.most.said, self._governor.frames
                 self._publish(ended=True)
             if self._table is not None:
                 self._table.finish("", {"source": self._uri})
@@ -223,12 +220,11 @@ class Session:
             if taken == 1:
                 self.report.dropped_starting = skipped = source.dropped
             taken += 1
-            if self._governor is not None and taken > 1:
-                if self._governor.note(source.dropped - skipped, read.read_ms):
-                    pipeline.ease(self._governor.eased)
-                    left_out = self._governor.eased.said
-                    self._tell(f"To keep up: {left_out}." if left_out else "Keeping up with all of it again.")
-                skipped = source.dropped
+            if taken > 1 and self._governor.note(source.dropped - skipped, read.read_ms):
+                pipeline.ease(self._governor.eased)
+                left_out = self._governor.eased.said
+                self._tell(f"To keep up: {left_out}." if left_out else "Keeping up with all of it again.")
+            skipped = source.dropped
             pipeline.begin(read.frame, state=state, read_ms=read.read_ms)
             self._hand_on(pipeline.finished())
             self._obey()
@@ -284,9 +280,8 @@ class Session:
             self._pipeline.adopt(settings)
             self.report.begin_anew()
             self._recent.clear()
-            if self._governor is not None:
-                self._governor.restart(settings.acquire)
-                self._pipeline.ease(self._governor.eased)
+            self._governor.restart(settings.acquire)
+            self._pipeline.ease(self._governor.eased)
         self.settings = settings
 
     def _record(self, on: bool, first: DepthFrame | None = None) -> None:
@@ -384,7 +379,7 @@ class Session:
         told = replace(
             result,
             gain=gain_of({name: mean_of(each[name] for each in self._recent) for name in figures}),
-            given_up="" if self._governor is None else self._governor.eased.said,
+            given_up=self._governor.eased.said,
             look=self.settings.viewer,
         )
         self.report.take(told)

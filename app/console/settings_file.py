@@ -34,14 +34,14 @@ def to_toml(settings: Settings, *heading: str) -> str:
     Where the results went, as ``save``, is not among the settings: another run with them must not
     replace these. How a recording was played is left out where it was just played, for a sensor is not.
     """
-    tables = dataclasses.asdict(settings)
+    tables = dataclasses.asdict(settings, dict_factory=_stated)
     for name in ("save", "save_model", "overwrite", "record", "json", "table"):
-        del tables["viewer"][name]
+        tables["viewer"].pop(name, None)
     if settings.play == PlayOptions():
         tables["play"] = {}
     flat = {key: value for name in FLAT_SECTIONS for key, value in tables.pop(name).items()}
     told = "".join(f"# {_one_line(line)}\n" for line in heading)
-    return told + tomli_w.dumps(_stated({"schema": SCHEMA} | flat | tables))
+    return told + tomli_w.dumps({"schema": SCHEMA} | flat | tables)
 
 
 def _one_line(text: str) -> str:
@@ -49,11 +49,9 @@ def _one_line(text: str) -> str:
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
-def _stated(table: dict[str, Any]) -> dict[str, Any]:
+def _stated(entries: list[tuple[str, Any]]) -> dict[str, Any]:
     """A table without what is None, which TOML does not have."""
-    return {
-        key: _stated(value) if isinstance(value, dict) else value for key, value in table.items() if value is not None
-    }
+    return {key: value for key, value in entries if value is not None}
 
 
 def settings_arguments(path: Path, defaults: dict[str, Any]) -> list[str]:

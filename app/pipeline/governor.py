@@ -66,8 +66,8 @@ class Governor:
     ----------
     options : AcquireOptions
         What was asked for.
-    period_ms : float
-        Time from frame to frame.
+    period_ms : float or None
+        Time from frame to frame; None where frames wait until they are made, and nothing is to be left out.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class Governor:
         In how many frames something was left out.
     """
 
-    def __init__(self, options: AcquireOptions, period_ms: float) -> None:
+    def __init__(self, options: AcquireOptions, period_ms: float | None) -> None:
         self._period_ms = period_ms
         self._patience = PATIENCE[0]
         self.frames, self.most = 0, ALL
@@ -87,7 +87,7 @@ class Governor:
 
     def restart(self, options: AcquireOptions) -> None:
         """Begin anew with what is asked for now."""
-        self._levels = levels(options)
+        self._levels = (ALL,) if self._period_ms is None else levels(options)
         self._level = self._seen = self._skipped = self._quiet = 0
         self._waited_ms = 0.0
         self._tried = False
@@ -114,7 +114,7 @@ class Governor:
             return self._move(1)
         if self._seen < WINDOW:
             return False
-        spare = self._waited_ms > SPARE * self._seen * self._period_ms
+        spare = self._period_ms is not None and self._waited_ms > SPARE * self._seen * self._period_ms
         self._quiet = self._quiet + 1 if spare else 0
         if self._tried and self._quiet >= self._patience:  # what was taken back last has lasted
             self._tried, self._patience = False, PATIENCE[0]
