@@ -74,7 +74,7 @@ def figure(
     selective-depth figure 1 bunny.ply --out fig1.pdf
         neural gas by epochs, of your own object
     """
-    from selective_depth.app.commands.paper import draw_figure
+    from selective_depth.app.commands.figures import draw_figure
 
     settings = Settings(**vars(selectors))
     return draw_figure(number, sources or SCENES, out, frame, settings, page, save)
@@ -103,7 +103,7 @@ def table(
     selective-depth table 1
         computing times on the three scenes, as in the paper
     """
-    from selective_depth.app.commands.paper import print_times
+    from selective_depth.app.commands.figures import print_times
 
     return print_times(sources or SCENES, frame)
 

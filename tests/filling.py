@@ -20,7 +20,7 @@ import rosbags.highlevel
 import rosbags.rosbag2  # noqa: F401
 
 from selective_depth.app import cli, cli_compare  # noqa: F401
-from selective_depth.app.commands import figures, files, model, paper, snapshot  # noqa: F401
+from selective_depth.app.commands import figures, files, model, snapshot  # noqa: F401
 from selective_depth.app.evaluation import evaluate  # noqa: F401
 from selective_depth.drivers import folder, oni, virtual  # noqa: F401
 from selective_depth.selectors import acquire, improvement, neural_gas  # noqa: F401

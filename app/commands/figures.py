@@ -1,4 +1,4 @@
-"""The neural gas figures of the paper (Fig. 1 and 2), and the table behind the defaults."""
+"""The figures of the paper and its table, each under its own number, and the table behind the defaults."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from selective_depth.app.commands.snapshot import draw_snapshot, is_folder, nth_frame, short_name, tell_of, write_all
+from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import check_output, write_output
-from selective_depth.app.pictures import Panel, Row
-from selective_depth.app.pictures.panels import backdrop, draw_kept_triangles, draw_nodes, shaded_panel, tinted
+from selective_depth.app.console.progress import waiting
+from selective_depth.app.pictures import Panel, Row, panels
 from selective_depth.app.pipeline import open_and_tell, say
+from selective_depth.app.settings import PanelOptions, Settings
 from selective_depth.drivers.frame import DepthFrame
+from selective_depth.selectors.improvement import ImprovementSelector
 from selective_depth.selectors.neural_gas import EdgeMetric, NeuralGasSelector, RegionSelection, delaunay_regions
 from selective_depth.selectors.reconstruct import reconstruct
 from selective_depth.selectors.seeds import SeedGrid
@@ -33,6 +37,8 @@ DENSITIES = (32, 40, 64, 75)
 METRICS: tuple[EdgeMetric, EdgeMetric] = ("3d", "image")
 TABLE_NODES = (700, 1400, 2800, 5600)
 TABLE_EPOCHS = (5, 10, 20, 50, 100)
+PAPERS_SECONDS = {"workstation": (153.0, 1.39), "ball": (153.9, 1.41), "firehose": (150.0, 1.41)}
+"""Table 1: neural gas (Matlab) and improvement map (C++, i7-2630) on its scenes of these names."""
 
 _NAMES = {"3d": "edges short in space", "image": "edges short in the image"}
 
@@ -156,24 +162,94 @@ def _figure(
     frame: DepthFrame, note: str, columns: Sequence[tuple[str, str, dict[EdgeMetric, RegionSelection]]]
 ) -> list[Row]:
     """The object, then a column per training: nodes above, kept triangles by each metric below."""
-    first = shaded_panel(frame, "Object", note)
+    first = panels.shaded_panel(frame, "Object", note)
     short = {title: re.sub(r"\W+", "-", title) for title, _, _ in columns}
     nodes = [
         Panel(
-            f"nodes-{short[title]}", title, backdrop(frame), note=words, overlay=partial(draw_nodes, regions=by["3d"])
+            f"nodes-{short[title]}", title, panels.backdrop(frame), note=words, overlay=partial(panels.draw_nodes, regions=by["3d"])
         )
         for title, words, by in columns
     ]  # fmt: skip
     rows: list[Row] = [("Nodes of the neural gas", [first, *nodes])]
     for metric in METRICS:
         kept = [
-            Panel(f"kept-{metric}-{short[title]}", title, tinted(backdrop(frame), by[metric].mask),
+            Panel(f"kept-{metric}-{short[title]}", title, panels.tinted(panels.backdrop(frame), by[metric].mask),
                   note=f"{by[metric].mask.mean():.0%} of the frame",
-                  overlay=partial(draw_kept_triangles, regions=by[metric]))
+                  overlay=partial(panels.draw_kept_triangles, regions=by[metric]))
             for title, _, by in columns
         ]  # fmt: skip
         rows.append((f"Triangles kept: {_NAMES[metric]}", [None, *kept]))
     return rows
+
+
+def draw_figure(
+    number: int,
+    sources: Sequence[str],
+    out: Path | None,
+    frame: int,
+    settings: Settings,
+    page: PanelOptions,
+    save: Path | None = None,
+) -> int:
+    """Make a figure of the paper of some sources; returns the exit code.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    UsageError
+        If it is of a format that cannot be made, or a source has no such frame.
+    """
+    path = out or Path(f"figure-{number}.png")
+    is_folder(path)  # refused before the work is done
+    check_output(save)
+    if number == 5:
+        return draw_snapshot(sources, frame, path, settings, page)
+    gas, trained, stems = settings.gas, [], []
+    frames = [nth_frame(uri, frame) for uri in (sources if number == 4 else sources[:1])]
+    if number == 1:
+        seeds = object_seeds(frames[0], FIRST_POINTS)
+        with waiting(f"training {len(EPOCHS)} times"):
+            trained = list(epoch_selections(seeds, EPOCHS, FIRST_NODES, gas.seed))
+        rows = epochs_figure(frames[0], seeds, trained)
+    elif number == 2:
+        with waiting(f"training {len(DENSITIES)} times"):
+            rows = densities_figure(frames[0], DENSITIES, gas.epochs, gas.seed)
+    else:
+        stems = [f"{short_name(uri)}-" for uri in sources]
+        rows = [
+            (f"{stem[:-1]}, frame {frame}", (panels.shaded_panel(shown), panels.depth_panel(shown)))
+            for stem, shown in zip(stems, frames, strict=True)
+        ]
+    tell_of(write_all(path, f"figure-{number}", rows, stems or [""] * len(rows), page, legend=False))
+    if save is not None and trained:
+        from selective_depth.app.viewer import save_trainings
+
+        save_trainings(save, frames[0], ((length, chosen["3d"]) for length, chosen in trained))
+        say(f"wrote {save}; open it with 'rerun {save}'")
+    return OK
+
+
+def print_times(sources: Sequence[str], frame: int) -> int:
+    """Print what both methods take on each source, the paper's times beside them."""
+    rows = []
+    improvement = ImprovementSelector(exponent=1.9999, by_sums=True)
+    methods = (NeuralGasSelector(algorithm="exact"), NeuralGasSelector(), improvement)
+    warm = SeedGrid.from_frame(nth_frame(sources[0], frame))
+    for method in (NeuralGasSelector(10, 1, "exact"), *methods[1:]):
+        method.select(warm)  # compiled before anything is timed
+    for uri in sources:
+        seeds = SeedGrid.from_frame(nth_frame(uri, frame))
+        seconds = []
+        for method in methods:
+            start = time.perf_counter()
+            method.select(seeds)
+            seconds.append(time.perf_counter() - start)
+        papers = PAPERS_SECONDS.get(short_name(uri), ())
+        rows.append((short_name(uri), *(f"{s:.3g}" for s in (*seconds, *papers))))
+    heads = ("", "NG exact", "NG fast", "ImpMap", "paper: NG", "ImpMap")
+    print_table(rows, heads, title="Table 1: seconds per frame")
+    return OK
 
 
 class TableRow(NamedTuple):

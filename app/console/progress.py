@@ -9,16 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Self
 
+from rich import progress
 from rich.console import Console, RenderableType
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-)
 from rich.text import Text
 
 PATIENCE_S = 2.0
@@ -40,10 +32,10 @@ def waiting(why: str) -> Iterator[None]:
         timer.cancel()
 
 
-class _Bar(Progress):
+class _Bar(progress.Progress):
     """A progress bar with a line below it."""
 
-    def __init__(self, *columns: ProgressColumn, hint: str, **options: Any) -> None:
+    def __init__(self, *columns: progress.ProgressColumn, hint: str, **options: Any) -> None:
         self._hint = hint
         super().__init__(*columns, **options)
 
@@ -72,13 +64,13 @@ class FrameProgress:
         self._start_s = self._said_s = time.monotonic()
         self._drawn = sys.stderr.isatty()
         self._bar = _Bar(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            *((BarColumn(),) if total else ()),
-            MofNCompleteColumn(),
-            TextColumn("frames"),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[note]}"),
+            progress.SpinnerColumn(),
+            progress.TextColumn("{task.description}"),
+            *((progress.BarColumn(),) if total else ()),
+            progress.MofNCompleteColumn(),
+            progress.TextColumn("frames"),
+            progress.TimeElapsedColumn(),
+            progress.TextColumn("{task.fields[note]}"),
             console=Console(stderr=True),
             transient=True,
             hint=hint,
