@@ -162,24 +162,21 @@ def _figure(
     frame: DepthFrame, note: str, columns: Sequence[tuple[str, str, dict[EdgeMetric, RegionSelection]]]
 ) -> list[Row]:
     """The object, then a column per training: nodes above, kept triangles by each metric below."""
-    first = panels.shaded_panel(frame, "Object", note)
-    short = {title: re.sub(r"\W+", "-", title) for title, _, _ in columns}
-    nodes = [
-        Panel(
-            f"nodes-{short[title]}", title, panels.backdrop(frame), note=words, overlay=partial(panels.draw_nodes, regions=by["3d"])
-        )
-        for title, words, by in columns
-    ]  # fmt: skip
-    rows: list[Row] = [("Nodes of the neural gas", [first, *nodes])]
-    for metric in METRICS:
-        kept = [
-            Panel(f"kept-{metric}-{short[title]}", title, panels.tinted(panels.backdrop(frame), by[metric].mask),
-                  note=f"{by[metric].mask.mean():.0%} of the frame",
-                  overlay=partial(panels.draw_kept_triangles, regions=by[metric]))
-            for title, _, by in columns
-        ]  # fmt: skip
-        rows.append((f"Triangles kept: {_NAMES[metric]}", [None, *kept]))
-    return rows
+    ground = panels.backdrop(frame)
+    nodes: list[Panel | None] = [panels.shaded_panel(frame, "Object", note)]
+    kept: dict[EdgeMetric, list[Panel | None]] = {metric: [None] for metric in METRICS}
+    for title, words, by_metrics in columns:
+        stem = re.sub(r"\W+", "-", title)
+        drawn = partial(panels.draw_nodes, regions=by_metrics["3d"])
+        nodes.append(Panel(f"nodes-{stem}", title, ground, note=words, overlay=drawn))
+        for metric, regions in by_metrics.items():
+            image, share = panels.tinted(ground.copy(), regions.mask), f"{regions.mask.mean():.0%} of the frame"
+            drawn = partial(panels.draw_kept_triangles, regions=regions)
+            kept[metric].append(Panel(f"kept-{metric}-{stem}", title, image, note=share, overlay=drawn))
+    return [
+        ("Nodes of the neural gas", nodes),
+        *((f"Triangles kept: {_NAMES[metric]}", row) for metric, row in kept.items()),
+    ]
 
 
 def draw_figure(
