@@ -34,9 +34,8 @@ def run(arguments: Sequence[str], examples: Sequence[command.Example]) -> int:
     int
         The exit code, out of `exit_codes`.
     """
-    words = list(arguments)
-    debug = _take(words, "--debug")
-    verbose = _take(words, "-v", "--verbose")
+    debug, verbose = "--debug" in arguments, "-v" in arguments or "--verbose" in arguments
+    words = [word for word in arguments if word not in ("--debug", "-v", "--verbose")]
     try:
         with interrupt.recognised():
             return _dispatch(words, verbose, examples)
@@ -86,13 +85,6 @@ def _value(words: list[str], name: str, need: str) -> str | None:
                 raise UsageError(f"{name} needs {need}")
             return [words.pop(at), words.pop(at)][1]
     return None
-
-
-def _take(words: list[str], *names: str) -> bool:
-    found = [word for word in words if word in names]
-    for word in found:
-        words.remove(word)
-    return bool(found)
 
 
 def _versions() -> str:
