@@ -214,7 +214,7 @@ def check(
     repair : Path
         Write what is readable of one .oni file to this new file, which OpenNI2 replays.
     timeout : float
-        Look at an .oni file for so long at most.
+        Look at an .oni file for at most this long.
 
     Examples
     --------
@@ -270,7 +270,7 @@ def batch(
 ) -> int:
     """Run every recording of an archive through both selectors: a table each, and a summary.
 
-    Started again, it goes on where it was: what is done and unchanged is left as it is.
+    Started again, it continues where it stopped; what is done and unchanged is kept.
 
     Parameters
     ----------
@@ -353,7 +353,7 @@ def screenshot(
     frame : int
         The frame to show; by default the last.
     time : float
-        Show the time so many seconds after the first frame instead.
+        Show the time this many seconds after the first frame instead.
     view : str
         Show one view alone: its title, or a part of it.
     size : tuple of int

@@ -52,7 +52,7 @@ def figure(
     Parameters
     ----------
     number : int
-        The paper's number of it.
+        Its number in the paper.
     sources : tuple of str
         As for replay; by default the three virtual scenes, of which 1 and 2 take the first.
     out : Path
@@ -63,7 +63,7 @@ def figure(
     frame : int
         Which frame of each source, from 0.
     selectors
-        Their options.
+        Options of the selectors.
     page
         The page.
 
@@ -92,7 +92,7 @@ def table(
     Parameters
     ----------
     number : int
-        The paper's number of it.
+        Its number in the paper.
     sources : tuple of str
         As for replay; by default the three virtual scenes.
     frame : int
@@ -117,7 +117,7 @@ def nodes(source: Source, /, every: Limit = None, out: Annotated[Path | None, op
     source : str
         Anything that 'replay' takes.
     every : int
-        Take every so many frames; by default the first alone.
+        Take every N-th frame; by default the first alone.
     out : Path
         Write the table as Markdown as well.
 

@@ -135,7 +135,7 @@ class GasOptions:
     edge_metric: Literal["3d", "image"] = "3d"
     """Measure edges in millimetres in space, or in pixels in the image."""
     factor: Positive = 1.0
-    """An edge is long beyond this many mean edge lengths."""
+    """An edge is long if it exceeds this many mean edge lengths."""
 
 
 @dataclass(frozen=True)
@@ -164,18 +164,18 @@ class AcquireOptions:
     """Spending a budget of further measurements."""
 
     budget: Annotated[Share, arg(metavar="SHARE")] = 0.0
-    """Further measurements as a share of the frame's pixels, 0..1; 0 takes none."""
+    """Further measurements as a share of the frame's pixels, 0..1; 0 for none."""
     rounds: Rounds = 2
     """Rounds in which they are taken, each knowing what the last one found."""
     memory: Literal["off", "still"] = "off"
-    """still: what was measured stays known, for a camera that stands still; then the budget is all
-    that a frame measures after the first, whose seeds and 5 % more begin it."""
+    """still, for a camera that does not move: remember what was measured. The first frame measures its
+    seeds and 5 % more; after it, the budget is all that a frame measures."""
     by: Annotated[str, arg(metavar="NAME")] = "auto"
     """What drives the shots: auto (the best there is), surface, step, improvement, neural-gas,
     neural-gas-edges, even, or FILE.py:NAME, a selector of your own."""
     even_every: Annotated[int | None, whole(0), optional("N")] = None
-    """Spend the same evenly as well in every N-th frame, to see what selecting gains; 0 in none.
-    By default in every 3rd of a sensor's and every 10th of a recording's."""
+    """In every N-th frame, measure as many pixels on an even lattice too, to show what selecting gains;
+    0 for never. By default every 3rd frame of a sensor and every 10th of a recording."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ class RunOptions:
     threads: Limit = None
     """Threads of each stage; by default one, or one per processor where frames do not overlap."""
     no_governor: Flag = False
-    """Leave nothing out where the machine is too slow to keep up with a sensor."""
+    """Leave nothing out, even where the machine is too slow to keep up with a sensor."""
 
 
 @dataclass(frozen=True)
@@ -201,9 +201,9 @@ class PlayOptions:
     loop: Flag = False
     """Begin again at the end, until Ctrl-C."""
     realtime: Flag = False
-    """Play at the recorded rate, the newest frame first, as a sensor would deliver."""
+    """Play at the recorded rate as a sensor would: the newest frame wins, and others may be skipped."""
     speed: Annotated[float | None, positive, optional("FACTOR")] = None
-    """The same, so many times as fast as it was recorded: 0.5 is slow motion."""
+    """The same at this multiple of the recorded rate; 0.5 is slow motion."""
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,7 @@ class ComparisonOptions:
     every: Count = 20
     """Take every N-th frame."""
     frames: Limit = None
-    """Take at most N frames of each source."""
+    """Take at most this many frames of each source."""
     budget: Shares = (0.05, 0.10)
     """Further measurements as shares of the frame's pixels."""
     rounds: Rounds = 8
@@ -320,17 +320,17 @@ class BatchOptions:
     """Of every frame, as PNG: masks (1 neural gas + 2 improvement), maps (the improvement map,
     65535 = the best), depth (the model in mm)."""
     stills: Natural = 0
-    """So many pictures of frames, spread over it."""
+    """This many pictures of single frames, spread over the recording."""
     rrd: Flag = False
     """A Rerun recording."""
     frames: Limit = None
-    """At most so many frames of each."""
+    """Take at most this many frames of each."""
     scheduler: Scheduler = None
     """A Dask scheduler: its address or its file; by default processes of this machine."""
     workers: Limit = None
-    """How many of these; by default one per processor."""
+    """Number of these processes; by default one per processor."""
     force: Flag = False
-    """Do again what is done and unchanged."""
+    """Redo what is already done and unchanged."""
 
 
 @dataclass(frozen=True)

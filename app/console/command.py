@@ -136,7 +136,7 @@ def _example_lines(examples: Sequence[Example]) -> list[str]:
 
 
 def _source_help() -> list[str]:
-    lines = ["With any command that takes a SOURCE or DEVICE, for what it does not say of itself:"]
+    lines = ["With any command that takes a SOURCE or DEVICE, for what the source itself does not tell:"]
     for name, (value, told) in SOURCE_OPTIONS.items():
         first = f"  --{name} {value}".ljust(23)
         lines += textwrap.wrap(told, 97, initial_indent=f"{first} " if len(first) > 23 else first,
