@@ -69,7 +69,7 @@ def check_picture(path: Path | None, endings: Sequence[str] = PICTURES, what: st
     """
     if path is not None and path.suffix.lower() not in endings:
         allowed = f"{', '.join(endings[:-1])} or {endings[-1]}"
-        raise UsageError(f"'{path}' is a {what} to make; its name must end in {allowed}.")
+        raise UsageError(f"'{path}' cannot be a {what}: its name must end in {allowed}.")
     check_output(path)
 
 
