@@ -19,8 +19,7 @@ import pyarrow.parquet as pq
 
 from selective_depth.app.console.output import make_folder
 from selective_depth.app.console.tables import metadata_of, parquet_writer
-from selective_depth.app.pipeline import STAGES, FrameResult, figures_of
-from selective_depth.app.pipeline.report import Mean
+from selective_depth.app.pipeline import STAGES, FrameResult, Mean, figures_of
 from selective_depth.drivers.errors import OutputError
 
 SCHEMA = 1

@@ -15,9 +15,7 @@ import pyarrow.compute as pc
 from rich.console import Console
 from rich.markup import escape
 
-from selective_depth.app.archive import Batch, Job, engine
-from selective_depth.app.archive.batch import SUMMARY_FILE
-from selective_depth.app.archive.engine import Stream, dashboard
+from selective_depth.app.archive import SUMMARY_FILE, Batch, Job, Stream, dashboard, engine
 from selective_depth.app.commands.model import save_depth, save_result
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.errors import UsageError
@@ -25,8 +23,7 @@ from selective_depth.app.console.exit_codes import FAILED, OK
 from selective_depth.app.console.output import make_folder, write_image
 from selective_depth.app.console.progress import FrameProgress
 from selective_depth.app.pictures import contact_sheet, write_picture
-from selective_depth.app.pipeline import FrameResult, StageTimes, figures_of, say
-from selective_depth.app.pipeline.selecting import selector_of
+from selective_depth.app.pipeline import FrameResult, StageTimes, figures_of, say, selector_of
 from selective_depth.app.settings import BatchOptions, Settings, ViewerOptions
 from selective_depth.drivers.source import DepthSource
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from selective_depth.app.archive.batch import recordings
-from selective_depth.app.archive.unit import Recording
+from selective_depth.app.archive import Recording, recordings
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import FAILED, OK

@@ -12,8 +12,7 @@ from selective_depth.app.commands.snapshot import nth_frame
 from selective_depth.app.console.exit_codes import OK
 from selective_depth.app.console.output import make_folder, replacing, write_image, write_output
 from selective_depth.app.pictures import palette
-from selective_depth.app.pipeline import FrameResult, say
-from selective_depth.app.pipeline.selecting import selector_of
+from selective_depth.app.pipeline import FrameResult, say, selector_of
 from selective_depth.app.settings import Settings
 from selective_depth.drivers.frame import Camera, ColourArray, DepthFrame
 from selective_depth.selectors.acquire import Acquisition, acquire

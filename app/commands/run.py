@@ -8,8 +8,7 @@ from selective_depth.app.commands.session import Session, beside
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.keys import KEYS, pressed
 from selective_depth.app.console.output import check_output, write_output
-from selective_depth.app.pipeline import print_report, say
-from selective_depth.app.pipeline.report import is_settings
+from selective_depth.app.pipeline import is_settings, print_report, say
 from selective_depth.app.settings import AcquireOptions, Settings
 from selective_depth.drivers.oni import check_place
 

@@ -9,10 +9,8 @@ from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pipeline import say
+from selective_depth.drivers.openni import find_runtime, survey, usb_advice
 from selective_depth.drivers.openni import record as record_oni
-from selective_depth.drivers.openni import survey
-from selective_depth.drivers.openni.runtime import find_runtime
-from selective_depth.drivers.openni.usb import usb_advice
 
 UNKNOWN_ADVICE = (
     "Is it plugged in and powered? A Kinect for Xbox 360 needs libfreenect's OpenNI2 driver beside"

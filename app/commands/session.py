@@ -14,17 +14,29 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from selective_depth.app.archive.table import FigureTable, writing
-from selective_depth.app.archive.table import row_of as figure_row
+from selective_depth.app.archive import FigureTable, writing
+from selective_depth.app.archive import row_of as figure_row
 from selective_depth.app.commands.model import save_result
 from selective_depth.app.commands.steering import Recording, Status, Steering, changed, unused
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pictures import contact_sheet, write_picture
-from selective_depth.app.pipeline import Feed, FrameResult, Governor, Pipeline, SensorNote, figures_of, open_and_tell
-from selective_depth.app.pipeline.feed import state_of
-from selective_depth.app.pipeline.report import RunReport, gain_of, mean_of, save_settings, say
+from selective_depth.app.pipeline import (
+    Feed,
+    FrameResult,
+    Governor,
+    Pipeline,
+    RunReport,
+    SensorNote,
+    figures_of,
+    gain_of,
+    mean_of,
+    open_and_tell,
+    save_settings,
+    say,
+    state_of,
+)
 from selective_depth.app.settings import Settings
 from selective_depth.app.viewer import Viewer, join_command
 from selective_depth.drivers.errors import DeviceLostError, OutputError, SourceTimeoutError

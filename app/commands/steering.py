@@ -10,12 +10,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.output import make_folder
-from selective_depth.app.pipeline.selecting import NAMES
+from selective_depth.app.pipeline import SELECTOR_NAMES
 from selective_depth.app.settings import LAYERS, LAYOUTS, MOST_ROUNDS, AcquireOptions, Settings, ViewerOptions
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.oni import OniRecorder
@@ -33,7 +34,7 @@ NEWS = 5
 _ALLOWED: dict[str, Callable[[Any], object]] = {
     "budget": lambda x: 0 <= x <= 1,
     "rounds": lambda x: 1 <= x <= MOST_ROUNDS and int(x) == x,
-    "by": lambda x: x in NAMES,
+    "by": lambda x: x in SELECTOR_NAMES,
     "memory": lambda x: x in ("off", "still"),
     "layout": lambda x: x in LAYOUTS,
     "hide": lambda x: set(x) <= set(LAYERS),
@@ -131,7 +132,7 @@ class Steering:
             "-": ("budget", next((x for x in BUDGETS[::-1] if x < spend.budget - 1e-9), 0.0)),
             "]": ("rounds", min(spend.rounds + 1, 16)),
             "[": ("rounds", max(spend.rounds - 1, 1)),
-            "s": ("by", NAMES[(NAMES.index(spend.by) + 1) % len(NAMES)] if spend.by in NAMES else NAMES[0]),
+            "s": ("by", dict(pairwise(SELECTOR_NAMES)).get(spend.by, SELECTOR_NAMES[0])),
             "m": ("memory", "off" if spend.memory == "still" else "still"),
             "r": ("recording", not status.recording),
             "p": ("snapshot", None),

@@ -15,8 +15,8 @@ from nicegui import ui
 from selective_depth.app.commands.steering import Status, Steering
 from selective_depth.app.console.errors import ViewerError
 from selective_depth.app.demo.guard import Guard
-from selective_depth.app.pictures.palette import STATE_COLOURS
-from selective_depth.app.pipeline.selecting import NAMES
+from selective_depth.app.pictures import STATE_COLOURS
+from selective_depth.app.pipeline import SELECTOR_NAMES
 from selective_depth.app.settings import LAYERS, LAYOUTS, Layer
 from selective_depth.app.viewer import free_port, web_address
 
@@ -176,7 +176,7 @@ class _Page:
         rounds = ui.slider(min=1, max=16, step=1, value=1).props("dense")
         self._control(rounds, "rounds", lambda s: s.acquire.rounds, int)
         by = ui.select(LABELS, label="Shots chosen by", value="auto").classes("w-full").props("dense outlined")
-        self._control(by, "by", lambda s: s.acquire.by if s.acquire.by in NAMES else None)
+        self._control(by, "by", lambda s: s.acquire.by if s.acquire.by in SELECTOR_NAMES else None)
         memory = ui.switch("Memory (camera stands still)").props("dense")
         self._control(memory, "memory", lambda s: s.acquire.memory == "still", lambda on: "still" if on else "off")
         layout = ui.toggle(list(LAYOUTS), value="visitor").props("dense no-caps spread").classes("w-full")

@@ -21,7 +21,7 @@ from itertools import product
 
 import numpy as np
 
-from selective_depth.app.archive.engine import engine
+from selective_depth.app.archive import engine
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of, strategy_of

@@ -18,8 +18,7 @@ from selective_depth.drivers.errors import SourceNotFoundError
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.drivers.open import open_source
 from selective_depth.selectors.acquire import acquire
-from selective_depth.selectors.memory import TemporalAcquisition, TemporalStep
-from selective_depth.selectors.memory.store import KEPT
+from selective_depth.selectors.memory import KEPT, TemporalAcquisition, TemporalStep
 from selective_depth.selectors.quality import errors_of
 from selective_depth.selectors.seeds import SeedGrid
 

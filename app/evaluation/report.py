@@ -19,9 +19,7 @@ from selective_depth.app.console.progress import FrameProgress
 from selective_depth.app.evaluation.evaluate import Outcome, Results, check_named, frames_of, outcomes, summarise
 from selective_depth.app.evaluation.over_time import Course, over_time, truth_of
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategy_of
-from selective_depth.app.pictures import Panel, sheet, write_picture
-from selective_depth.app.pictures.panels import depth_panel, error_panel, shots_panel
-from selective_depth.app.pictures.sheets import WIDTH_IN
+from selective_depth.app.pictures import WIDTH_IN, Panel, depth_panel, error_panel, sheet, shots_panel, write_picture
 from selective_depth.app.pipeline import say
 from selective_depth.app.settings import ComparisonOptions, EvaluationFiles, PictureOptions, Settings
 from selective_depth.drivers.frame import DepthFrame

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.evaluation.quadtree import quadtree
-from selective_depth.app.pipeline.selecting import gas_of, improvement_of, selector_of
+from selective_depth.app.pipeline import gas_of, improvement_of, selector_of
 from selective_depth.app.settings import AcquireOptions, Settings
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import acquire

@@ -13,7 +13,7 @@ from typing import Any, Self
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline.governor import ALL, Eased
 from selective_depth.app.pipeline.result import FrameResult, Model
-from selective_depth.app.pipeline.selecting import NAMES, gas_of, improvement_of, selector_of
+from selective_depth.app.pipeline.selecting import SELECTOR_NAMES, gas_of, improvement_of, selector_of
 from selective_depth.app.pipeline.timing import StageTimes
 from selective_depth.app.pipeline.warm_up import compiling_beside
 from selective_depth.app.settings import AcquireOptions, Settings
@@ -299,7 +299,7 @@ class Pipeline:
 def switched(options: AcquireOptions) -> Iterator[AcquireOptions]:
     """The same acquisition by each selector, and remembered: what is switched between while a run goes on."""
     spending = replace(options, budget=options.budget or 0.01, rounds=2, memory="off", even_every=0)
-    for by in NAMES[1:]:
+    for by in SELECTOR_NAMES[1:]:
         yield replace(spending, by=by)
     yield replace(spending, by="auto", rounds=1)
     yield replace(spending, by="auto", memory="still", even_every=1)

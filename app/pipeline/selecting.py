@@ -15,7 +15,7 @@ from selective_depth.selectors.improvement import ImprovementSelector
 from selective_depth.selectors.neural_gas import LongEdgeSelector, NeuralGasSelector
 from selective_depth.selectors.selection import Selector, Worth
 
-NAMES = ("auto", "surface", "step", "improvement", "neural-gas", "neural-gas-edges", "even")
+SELECTOR_NAMES = ("auto", "surface", "step", "improvement", "neural-gas", "neural-gas-edges", "even")
 """What ``--by`` takes, besides FILE.py:NAME."""
 
 
@@ -40,7 +40,7 @@ def selector_of(settings: Settings, threads: int | None) -> Selector | Worth:
     Parameters
     ----------
     settings : Settings
-        Options of a run; `acquire.by` is one of `NAMES`, or ``FILE.py:NAME``, a selector or a
+        Options of a run; `acquire.by` is one of `SELECTOR_NAMES`, or ``FILE.py:NAME``, a selector or a
         function from samples to a worth for every pixel.
     threads : int or None
         Kernel threads.
@@ -69,7 +69,7 @@ def _users_own(by: str) -> Selector | Worth:
     path = Path(file)
     if not colon or path.suffix != ".py":
         raise UsageError(
-            f"--by is '{by}'; it must be one of {', '.join(NAMES)}, or FILE.py:NAME, a selector of your own."
+            f"--by is '{by}'; it must be one of {', '.join(SELECTOR_NAMES)}, or FILE.py:NAME, a selector of your own."
         )
     if not path.is_file():
         raise UsageError(f"--by is '{by}', but there is no file '{file}'; check its name.")
