@@ -11,7 +11,7 @@ import pytest
 from selective_depth.app.cli import run
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline.pipeline import Pipeline
-from selective_depth.app.pipeline.selecting import NAMES, selector_of
+from selective_depth.app.pipeline.selecting import SELECTOR_NAMES, selector_of
 from selective_depth.app.settings import AcquireOptions, GasOptions, SeedOptions, Settings
 from selective_depth.drivers.frame import Camera, DepthFrame
 
@@ -51,7 +51,7 @@ def shots(by: str, rounds: int = 2) -> tuple[str, np.ndarray]:
 
 
 def test_every_name_drives_the_shots_its_own_way() -> None:
-    chosen = {name: shots(name) for name in NAMES}
+    chosen = {name: shots(name) for name in SELECTOR_NAMES}
     names = [by for by, _ in chosen.values()]
     assert all(names)
     assert chosen["auto"][0] == chosen["surface"][0] == "surface score"

@@ -22,7 +22,7 @@ from selective_depth.app.commands.session import Session
 from selective_depth.app.commands.steering import BUDGETS, MEMORY_BUDGET, Status, Steering, changed
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.pipeline.pipeline import Pipeline
-from selective_depth.app.pipeline.selecting import NAMES
+from selective_depth.app.pipeline.selecting import SELECTOR_NAMES
 from selective_depth.app.settings import AcquireOptions, GasOptions, PlayOptions, SeedOptions, Settings, ViewerOptions
 from selective_depth.drivers.open import open_source
 
@@ -209,7 +209,8 @@ def test_everything_that_can_be_switched_to_is_compiled_before() -> None:
     ("key", "expected"),
     [
         ("+", ("budget", 0.1)), ("-", ("budget", 0.02)), ("]", ("rounds", 3)), ("[", ("rounds", 1)),
-        ("s", ("by", NAMES[1])), ("m", ("memory", "still")), (" ", ("paused", True)), ("r", ("recording", True)),
+        ("s", ("by", SELECTOR_NAMES[1])), ("m", ("memory", "still")), (" ", ("paused", True)),
+        ("r", ("recording", True)),
         ("p", ("snapshot", None)), ("l", ("layout", "visitor")), ("x", ("reset", None)), ("q", ("stop", None)),
     ],
 )  # fmt: skip
@@ -225,7 +226,7 @@ def test_keys_that_come_faster_than_frames_are_all_obeyed() -> None:
     with running(LIVE) as (_, steering, status):
         for key in "++]s?rr":
             steering.press(key)
-        until(lambda: status().acquire.by == NAMES[1], "the last of them")
+        until(lambda: status().acquire.by == SELECTOR_NAMES[1], "the last of them")
         assert (status().acquire.budget, status().acquire.rounds) == (0.2, 3)
         until(
             lambda: any("Recorded" in each or "holds no frame" in each for each in status().news), "a recording's end"
