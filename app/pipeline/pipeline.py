@@ -58,7 +58,8 @@ class Pipeline:
     While one is made the next is begun: two frames with a thread for each of their parts keep two
     processors busier than one frame whose every part waits for its slowest thread. Only a
     sensor's frames of which nothing is acquired are made one by one: they are ready long before
-    the next one comes, and so are seen at once.
+    the next one comes, and so are seen at once. With a memory the selectors see what it knows once
+    it has spent the frame's budget: they follow while it spends the next frame's.
 
     Parameters
     ----------
@@ -95,6 +96,8 @@ class Pipeline:
         # longest of them.
         self._beside: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(2, thread_name_prefix="beside")
         self._evening: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(1, thread_name_prefix="even")
+        self._remembering: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(1, thread_name_prefix="memory")
+        self._remembered: deque[Callable[[], None]] = deque()  # frames whose selectors wait for the memory
         self._under_way: deque[Callable[[], FrameResult]] = deque()
         self._even: Future[Model] | None = None
         self._counted: int | None = None
@@ -116,6 +119,7 @@ class Pipeline:
             As when made; nothing has changed then.
         """
         before, asked = self._asked.settings.acquire, self._ask(settings)
+        self._catch_up()
         self._asked = replace(asked, eased=self._asked.eased)
         self._overlap = int(not self._one_thread and (settings.acquire.budget > 0 or not self._realtime))
         if before != settings.acquire:
@@ -127,6 +131,7 @@ class Pipeline:
 
     def forget(self) -> None:
         """Forget what a memory knows and where the nodes are: the next frame is the first."""
+        self._catch_up()
         self._memory = None
         self._gas = gas_of(self._asked.settings, self._threads)
 
@@ -178,14 +183,34 @@ class Pipeline:
         read_ms : float, default NaN
             How long the frame was waited for.
         """
-        start_s = time.perf_counter()
         asked, stages_ms = self._asked, {"read": read_ms}
         if math.isfinite(read_ms):
             self.times.add("read", read_ms)
-        memory: TemporalStep | None = None
-        modelling: Future[tuple[Acquisition | None, Model | None]]
         if asked.settings.acquire.memory == "still":
-            memory = self._remember(asked, frame, stages_ms)
+            remembering = self._remembering.submit(self._remember, asked, frame, stages_ms)
+            self._remembered.append(lambda: self._go_on(asked, frame, state, stages_ms, remembering.result()))
+            while len(self._remembered) > self._overlap:
+                self._remembered.popleft()()
+        else:
+            self._catch_up()
+            self._go_on(asked, frame, state, stages_ms)
+
+    def _catch_up(self) -> None:
+        """Let the selectors follow in all frames whose budget a memory has spent or is spending."""
+        while self._remembered:
+            self._remembered.popleft()()
+
+    def _go_on(
+        self,
+        asked: _Asked,
+        frame: DepthFrame,
+        state: str,
+        stages_ms: dict[str, float],
+        memory: TemporalStep | None = None,
+    ) -> None:
+        start_s = time.perf_counter()
+        modelling: Future[tuple[Acquisition | None, Model | None]]
+        if memory is not None:
             seeds = memory.seeds
             modelling = self._beside.submit(self._told_by, memory, frame, stages_ms)
         else:
@@ -217,11 +242,12 @@ class Pipeline:
 
     def finished(self) -> Iterator[FrameResult]:
         """Results that need not wait for another frame to be begun."""
-        while len(self._under_way) > self._overlap:
+        while len(self._under_way) > (0 if self._remembered else self._overlap):
             yield self._under_way.popleft()()
 
     def rest(self) -> Iterator[FrameResult]:
         """Results of all frames under way: at the end, or when no other frame is in sight."""
+        self._catch_up()
         while self._under_way:
             yield self._under_way.popleft()()
 
@@ -292,6 +318,7 @@ class Pipeline:
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
+        self._remembering.shutdown(cancel_futures=True)
         self._beside.shutdown(cancel_futures=True)
         self._evening.shutdown(cancel_futures=True)
 

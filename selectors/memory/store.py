@@ -138,3 +138,10 @@ def forget(memory: Memory, where: Bools) -> None:
     """Know nothing of some pixels any more."""
     for layer in (memory.place, memory.held, memory.missed, memory.fused_mm, memory.dissent):
         layer[where] = 0
+
+
+def forget_all(memory: Memory) -> None:
+    """Know nothing any more; a new memory's pages would have to be got, one by one."""
+    for layer in (memory.place, memory.held, memory.missed, memory.fused_mm, memory.dissent):
+        layer.fill(0)
+    memory.asked.fill(NEVER)

@@ -28,7 +28,7 @@ from selective_depth.selectors.memory.change import (
     contradicts,
     drift,
 )
-from selective_depth.selectors.memory.store import Memory, book, forget
+from selective_depth.selectors.memory.store import Memory, book, forget, forget_all
 from selective_depth.selectors.memory.worth import WRONG, Noise, shot_worth
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import REACH, Samples, seed_pitch_px
@@ -229,8 +229,7 @@ class TemporalAcquisition:
         self._still += 1
         restarted = self._frame == 0 or not self._look_out(sensor, changed)
         if restarted:
-            self._memory = Memory.of(self.shape)
-            self._surface = Surface(self.shape, self.threads)
+            forget_all(self._memory)
             self._still = 0
             changed[:] = True
         settled = self._probation < self._still  # never after a restart
@@ -246,7 +245,7 @@ class TemporalAcquisition:
                 self._measure_best(sensor, (self._shots - sensor.spent) // left)
             model_mm = self._surface.layers.depth_mm.copy()
         else:
-            model_mm = self._start(sensor)
+            model_mm = self._start(sensor, restarted)
         known = self._memory.held > 0
         return TemporalStep(
             frame=self._frame,
@@ -307,7 +306,7 @@ class TemporalAcquisition:
         changed[:] = maximum_filter(where, 2 * MARGIN_PX + 1)
         return True
 
-    def _start(self, sensor: _Sensor) -> Floats:
+    def _start(self, sensor: _Sensor, restarted: bool) -> Floats:
         """Acquire the frame as if it were the first, and return the model of it alone."""
         seeds = SeedGrid.measured(sensor, self.shape, self._grid.shape, camera=self._grid.camera)
         shots = max(self._first_shots, self._shots - len(self._lattice_uv))
@@ -316,8 +315,8 @@ class TemporalAcquisition:
         )
         self._by = acquisition.by
         model_mm = acquisition.reconstruct(self.threads)
-        if acquisition.plan is not None and not self._surface.points:  # it holds the same samples
-            self._surface = acquisition.plan.surface
+        if restarted:  # what is known is what the acquisition has measured, and its plan may have the model of that
+            self._surface = acquisition.plan.surface if acquisition.plan else Surface(self.shape, self.threads)
         self._book(sensor, 0)
         return model_mm
 
