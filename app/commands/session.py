@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import sys
 import threading
 import time
 from collections import deque
@@ -50,6 +51,9 @@ from selective_depth.selectors.parallel import default_threads
 log = logging.getLogger(__name__)
 WAIT_S = 0.1
 """How long nothing is looked at while a run is paused."""
+TURN_S = 1e-4
+"""How long a thread may keep the interpreter from another that waits for it. Kernels run without it and need it
+for a moment between two: with Python's own 5 ms a sensor's frames were skipped meanwhile (docs: limits.md)."""
 
 
 def beside(saved: Path) -> tuple[Path, Path]:
@@ -116,6 +120,8 @@ class Session:
         """
         report, seen = self.report, self.settings.viewer
         with ExitStack() as stack:
+            stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+            sys.setswitchinterval(TURN_S)
             with waiting(f"Opening {self._uri}"):
                 source = stack.enter_context(self._open())
             sensor = source.live
