@@ -39,7 +39,7 @@ def print_bench(report: BenchReport) -> None:
     if report.peers:
         others = [(f"{peer} / {stage}", f"{more} times", took) for peer, took, stage, more in _peer_rows(report)]
         print_table(others, ("the same work elsewhere", "", "seconds"))
-    heads = ("whole runs, median (least-most)", "frames/s", "dropped", "loop p99 ms", "log p99 ms", "processor ms")
+    heads = ("median (range)", "frames/s", "dropped", "loop p99 ms", "log p99 ms", "processor ms")
     print_table(_load_rows(report), heads)
     Console(highlight=False).print(
         f"\n{report.source}: {report.frames} frames in real time at {report.fps:.1f} frames/s,"
@@ -53,7 +53,7 @@ def _load_rows(report: BenchReport) -> list[tuple[str, ...]]:
     """A load's name and its figures, each with its spread, as text."""
 
     def told(each: Spread) -> str:
-        return f"{each.median:.1f} ({each.least:.1f}-{each.most:.1f})"
+        return f"{each.median:.1f} ({each.least:.0f}-{each.most:.0f})"
 
     return [
         (name, *map(told, (load.fps, load.dropped, load.loop_p99_ms, load.log_p99_ms, load.cpu_ms)))

@@ -154,9 +154,11 @@ def doubtful_cells(padded: Floats, windows: Windows) -> Bytes:
     A seed that returned depth makes known what lies within reach of it; seeds two pitches
     away or farther are not asked. Shape (R + 1, C + 1), with the cells at the frame's edge.
     """
-    measured = (padded > 0).astype(np.uint8)
-    corners = measured[:-1, :-1] + measured[1:, :-1] + measured[:-1, 1:] + measured[1:, 1:]
-    beside = np.pad(corners, 1)
+    measured = (padded > 0).view(np.uint8)
+    pairs = measured[:-1] + measured[1:]
+    corners = pairs[:, :-1] + pairs[:, 1:]
+    beside = np.zeros((corners.shape[0] + 2, corners.shape[1] + 2), np.uint8)
+    beside[1:-1, 1:-1] = corners
     beside = beside[:-2] | beside[1:-1] | beside[2:]
     near = (beside[:, :-2] | beside[:, 1:-1] | beside[:, 2:]) > 0
     # Every window that a pixel here lies in holds all corners; a system takes two samples.

@@ -124,7 +124,7 @@ class ImprovementSelector:
         padded = np.zeros((rows + 2, columns + 2), np.float32)
         padded[1:-1, 1:-1] = samples.depth_mm
         doubtful = doubtful_cells(padded, windows)
-        half = _half(samples.depth_mm[samples.valid])
+        half = _half(samples.depth_mm)
         histograms: list[Ints] = []
 
         def band(first_row: int, end_row: int) -> None:
@@ -169,8 +169,9 @@ def _costs(padded: Floats) -> Floats:
 
 
 def _half(depth_mm: Floats) -> np.float32:
-    """The improvement that scores one half, of samples of these depths."""
-    return np.float32(HALF_SCORE * depth_mm.mean(dtype=np.float64) if depth_mm.size else 1.0)
+    """The improvement that scores one half, of samples of these depths, 0 where there is none."""
+    count = np.count_nonzero(depth_mm)
+    return np.float32(HALF_SCORE * depth_mm.sum(dtype=np.float64) / count if count else 1.0)
 
 
 class ImprovementPlan:
