@@ -272,10 +272,12 @@ class Pipeline:
         rounds = min(options.rounds, asked.eased.rounds)
         with self.times.stage("acquire", stages_ms):
             acquisition = acquire(frame.measure, seeds, options.budget, rounds, asked.selector, threads=self._threads)
+        # With its plan, a result on its way to the viewer would hold all of the mesh and its images.
+        measured = replace(acquisition, plan=None)
         if not draws:
-            return acquisition, None
+            return measured, None
         with self.times.stage("model", stages_ms):
-            return acquisition, Model.of(acquisition.reconstruct(self._threads), frame)
+            return measured, Model.of(acquisition.reconstruct(self._threads), frame)
 
     def _remember(self, asked: _Asked, frame: DepthFrame, stages_ms: dict[str, float]) -> TemporalStep:
         options, seeds = asked.settings.acquire, asked.settings.seeds
