@@ -364,14 +364,14 @@ class Session:
         with waiting("Compiling for this machine; the next run starts at once"):
             first = self.prepare(pipeline, frame)
             viewer.wait_ready()
+        gc.collect()
+        gc.freeze()  # else what was imported and compiled is looked through again and again, a tenth of a second each
         shown = source.live and self.settings.viewer.record is None
         if shown:
             self._start_clock()
             self._show(replace(first, state=state_of(source)))
             viewer.wait_taken()
             pipeline.times.clear()
-        gc.collect()
-        gc.freeze()  # else what was imported and compiled is looked through again and again, a tenth of a second each
         self._start_clock()
         log.info("ready after %.1f s", self._ready_s - began_s)
         return shown

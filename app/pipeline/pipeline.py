@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -51,6 +54,12 @@ class _AtOnce(Executor):
         return future
 
 
+def _give_way() -> None:
+    """Let what this thread does wait for the others, where a thread has a priority of its own."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+
+
 class Pipeline:
     """Both selectors and the acquisition, frame by frame, every stage timed.
 
@@ -95,7 +104,7 @@ class Pipeline:
         # The stages are compiled and free of the GIL: side by side they take as long as the
         # longest of them.
         self._beside: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(2, thread_name_prefix="beside")
-        self._evening: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(1, thread_name_prefix="even")
+        self._evening: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(1, "even", _give_way)
         self._remembering: Executor = _AtOnce() if one_thread else ThreadPoolExecutor(1, thread_name_prefix="memory")
         self._remembered: deque[Callable[[], None]] = deque()  # frames whose selectors wait for the memory
         self._under_way: deque[Callable[[], FrameResult]] = deque()
