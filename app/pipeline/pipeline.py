@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -57,7 +58,8 @@ class _AtOnce(Executor):
 def _give_way() -> None:
     """Let what this thread does wait for the others, where a thread has a priority of its own."""
     if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+        with suppress(OSError):  # a sandbox may forbid it; then all are alike
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
 
 
 class Pipeline:
@@ -217,6 +219,7 @@ class Pipeline:
         stages_ms: dict[str, float],
         memory: TemporalStep | None = None,
     ) -> None:
+        """Set all of a frame going that follows its seeds: those of a memory, or the frame's own."""
         start_s = time.perf_counter()
         modelling: Future[tuple[Acquisition | None, Model | None]]
         if memory is not None:
@@ -236,7 +239,7 @@ class Pipeline:
         begun_ms = (time.perf_counter() - start_s) * 1000
 
         def finish() -> FrameResult:
-            """Wait until all of it is made; stage "loop" is the time in `begin` and here."""
+            """Wait until all of it is made; stage "loop" is the time in `_go_on` and here."""
             start_s = time.perf_counter()
             improvement = improving.result()
             acquisition, model = modelling.result()

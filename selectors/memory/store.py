@@ -134,7 +134,7 @@ def book(memory: Memory, uv: Ints, depth_mm: Floats, now: int) -> None:
         memory.apart_mm2[v, u] = apart
 
 
-def forget(memory: Memory, where: Bools) -> None:
+def forget(memory: Memory, where: Bools | slice) -> None:
     """Know nothing of some pixels any more."""
     for layer in (memory.place, memory.held, memory.missed, memory.fused_mm, memory.dissent):
         layer[where] = 0
@@ -142,6 +142,5 @@ def forget(memory: Memory, where: Bools) -> None:
 
 def forget_all(memory: Memory) -> None:
     """Know nothing any more; a new memory's pages would have to be got, one by one."""
-    for layer in (memory.place, memory.held, memory.missed, memory.fused_mm, memory.dissent):
-        layer.fill(0)
+    forget(memory, slice(None))
     memory.asked.fill(NEVER)
