@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -65,6 +66,32 @@ def test_the_selectors_see_no_seed_that_the_memory_has_not_measured() -> None:
 def test_what_needs_a_budget_says_so(extra: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["replay", STILL, *QUICK, *extra]) == MISUSED
     assert "--budget" in capsys.readouterr().err
+
+
+def test_selectors_that_follow_a_memory_see_what_they_would_see_one_by_one() -> None:
+    """While the memory spends the next frame's budget; with a change of options on the way, too."""
+    settings = Settings(
+        seeds=SeedOptions(32, 32), gas=GasOptions(nodes=100), acquire=AcquireOptions(budget=0.03, memory="still")
+    )
+    more = replace(settings, acquire=replace(settings.acquire, budget=0.05))
+    with open_source(STILL) as source, Pipeline(settings) as side_by_side, Pipeline(settings, one_thread=True) as plain:
+        frames = list(source)
+        expected, found = [], []
+        for number, frame in enumerate(frames):
+            if number == 3:
+                plain.adopt(more)
+                side_by_side.adopt(more)
+            expected.append(plain.make(frame))
+            side_by_side.begin(frame)
+            found += side_by_side.finished()
+        found += side_by_side.rest()
+    assert [result.frame.index for result in found] == [frame.index for frame in frames]
+    for ours, theirs in zip(found, expected, strict=True):
+        assert ours.memory is not None and theirs.memory is not None and ours.model is not None
+        np.testing.assert_array_equal(ours.memory.uv, theirs.memory.uv)
+        np.testing.assert_array_equal(ours.model.depth_mm, theirs.model.depth_mm)
+        np.testing.assert_array_equal(ours.improvement.raw, theirs.improvement.raw)
+        np.testing.assert_array_equal(ours.regions.nodes_mm, theirs.regions.nodes_mm)
 
 
 @pytest.mark.slow
