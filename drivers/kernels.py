@@ -79,8 +79,9 @@ def _njit(*, cache: bool = False, **options: Any) -> Any:
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        # No kernel is called from C: a wrapper for that is a twelfth of the time to compile.
-        options["no_cfunc_wrapper"] = True
+        # No kernel is called from C: a wrapper for that is a twelfth of the time to compile. Nor does
+        # one look for divisions by zero, which keep loops from being vectorised.
+        options.update(no_cfunc_wrapper=True, error_model="numpy")
         dispatcher: Any = compiled(**options)(function)
         try:
             if cache:

@@ -45,7 +45,7 @@ class StepRule(NamedTuple):
     noise_mm2: float
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True)
 def score_rows(
     first: int, end: int, image_mm: Image, bits: npt.NDArray[np.uint64], rule: StepRule,
     score: Image,

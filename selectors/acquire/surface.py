@@ -46,23 +46,23 @@ def _note_misses(uv: Ints, depth_mm: Floats, radius: int, miss_sq: Ints, touched
         touched[top // TILE_PX : bottom // TILE_PX + 1, left // TILE_PX : right // TILE_PX + 1] = True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True)
 def _score_tiles(
-    first: int, end: int, tiles: Longs, layers: Layers, images: tuple[Floats, Ints, Floats], limits: tuple[float, float]
-) -> None:
+    first: int, end: int, tiles: Longs, layers: Layers, images: tuple[Floats, Ints, Floats, Floats],
+    limits: tuple[float, float],
+) -> None:  # fmt: skip
     """Score the pixels of the tiles first..end, numbered row by row.
 
-    `images`: the samples (mm), the squared distance to the nearest miss, and the score, filled in;
+    `images`: the samples (mm), the squared distance to the nearest miss, the score, filled in, and
+    for each column one over the distance of the two that tell its slope;
     `limits`: the squared reach of shots, pixels, and the variance where all agree, mm^2.
     """
-    image_mm, miss_sq, score = images
+    image_mm, miss_sq, score, inverse_du = images
     reach_sq, noise_mm2 = np.float32(limits[0]), np.float32(limits[1])
     height, width = score.shape
     columns = layers.touched.shape[1]
     depth = layers.depth_mm
     here = np.empty(width + 2, np.float32)  # a run of a row and a pixel on either side
-    inverse_du = np.full(width, 0.5, np.float32)  # of the columns that tell a slope
-    inverse_du[0] = inverse_du[-1] = 1
     at = first
     while at < end:
         tile = tiles[at]
@@ -143,6 +143,8 @@ class SurfacePlan:
         self._miss_sq = np.full(shape, FAR_SQ, np.int32)
         self._seen = 0
         self.score = np.zeros(shape, np.float32)
+        self._inverse_du = np.full(shape[1], 0.5, np.float32)  # of the columns that tell a slope
+        self._inverse_du[[0, -1]] = 1
 
     def look(self) -> None:
         """Take in what was measured since, and score again what that changes."""
@@ -155,7 +157,7 @@ class SurfacePlan:
         tiles = np.flatnonzero(layers.touched)
         layers.touched[:] = False
         limits = float(samples.reach_px**2), float(self._rule.noise_mm**2)
-        images = samples.image_mm, self._miss_sq, self.score
+        images = samples.image_mm, self._miss_sq, self.score, self._inverse_du
         in_bands(_score_tiles, len(tiles), self._rule.threads, tiles, layers, images, limits)
 
     def best(self, shots: int) -> Ints:

@@ -52,7 +52,7 @@ def gather_seeds(padded, rows, columns, i, j, samples):  # type: ignore[no-untyp
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def krige_row(i, padded, lattice, frame_shape, scratch, strip, held):  # type: ignore[no-untyped-def]
     """Krige all windows of one lattice row.
 
@@ -83,7 +83,10 @@ def krige_row(i, padded, lattice, frame_shape, scratch, strip, held):  # type: i
         # One sample alone says nothing of how depth varies around it.
         held[place[j]] = count if count > 1 else 0
     for batch in range(len(shape_of)):
-        if held[batch * LANES : (batch + 1) * LANES].max() == SEEDS:
+        full = False
+        for k in range(batch * LANES, (batch + 1) * LANES):
+            full |= held[k] == SEEDS
+        if full:
             j = lanes_columns[batch, 0]
             geometry = first_geometry + shape_of[batch]
             sides = up, down, lefts[j], rights[j]
@@ -108,7 +111,7 @@ def krige_row(i, padded, lattice, frame_shape, scratch, strip, held):  # type: i
                 strip[2, row, column, at] = improvement[p]
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
 def blend_down(  # type: ignore[no-untyped-def]
     share_one, one, row_one, held_one, share_other, other, row_other, held_other, mixed, held
 ):
@@ -131,7 +134,7 @@ def blend_down(  # type: ignore[no-untyped-def]
                 into[k] = weight_one[k] * here[k] + weight_other[k] * there[k]
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
 def blend_across(columns, places, mixed, held, estimate, variance, raw):  # type: ignore[no-untyped-def]
     """Blend one pixel row across from the windows left and right of each pixel."""
     first_weight, second_weight = columns.first_weight, columns.second_weight
@@ -177,7 +180,8 @@ def mark_known(y, padded, doubtful, lattice, held, line):  # type: ignore[no-unt
     first_place, second_place, _, _ = places
     estimate, variance, raw, known = line
     i = row_axis.first[y] if rows[0] <= y else -1
-    known[:] = True
+    for x in range(len(known)):
+        known[x] = True
     for j in range(len(columns) + 1):
         doubt = doubtful[i + 1, j]
         if doubt == 0:
@@ -187,7 +191,7 @@ def mark_known(y, padded, doubtful, lattice, held, line):  # type: ignore[no-unt
             known[x] = False
         # Of the 4x4 seeds around the cell, each makes known what it reaches of this row.
         for ni in range(max(i - 1, 0), min(i + 3, len(rows)) if doubt == 1 else 0):
-            left_over = reach_squared - (rows[ni] - y) ** 2
+            left_over = reach_squared - (rows[ni] - y) * (rows[ni] - y)
             half = int(math.sqrt(max(left_over, 0.0)))
             for nj in range(max(j - 2, 0), min(j + 2, len(columns)) if left_over >= 0 else 0):
                 if padded[ni + 1, nj + 1] > 0:
@@ -202,7 +206,7 @@ def mark_known(y, padded, doubtful, lattice, held, line):  # type: ignore[no-unt
             raw[x] = raw[x] if known[x] else np.float32(0)
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def improvement_rows(  # type: ignore[no-untyped-def]
     first_row, end_row, padded, doubtful, half, lattice, scratch, histogram, maps, known
 ):

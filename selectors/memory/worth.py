@@ -58,7 +58,7 @@ def _wrong() -> Floats:
 WRONG = _wrong()
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True)
 def shot_worth(
     first: int,
     end: int,

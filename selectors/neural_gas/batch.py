@@ -154,29 +154,38 @@ def _mean_distance(d2: Floats) -> float:
     return float(np.sqrt(d2).mean(dtype=np.float64))
 
 
-@njit(cache=True, nogil=True)
-def _sort_into_bins(nodes, nodes_uv, bin_px, rows, columns):  # type: ignore[no-untyped-def]
+# Kernels are given their arrays: to compile the making of one takes up to a quarter of a second.
+
+
+def _sort_into_bins(
+    nodes: Floats, nodes_uv: Floats, bin_px: float, rows: int, columns: int
+) -> tuple[Ints, Ints, Floats]:
     """Nodes, or seeds, ordered by image bin: first index of each bin, their numbers and coordinates."""
+    starts, cell = np.zeros(rows * columns + 2, np.int32), np.empty(len(nodes), np.int32)
+    number, xyz = np.empty(len(nodes), np.int32), np.empty((3, len(nodes)), np.float32)
+    _fill_bins(nodes, nodes_uv, bin_px, (rows, columns), cell, starts, number, xyz)
+    return starts[:-1], number, xyz
+
+
+@njit(cache=True, nogil=True)
+def _fill_bins(nodes, nodes_uv, bin_px, shape, cell, starts, number, xyz):  # type: ignore[no-untyped-def]
+    """Fill in what `_sort_into_bins` gives; `starts` has one more, all 0, that is of no use afterwards."""
+    rows, columns = shape
     count = len(nodes)
-    starts = np.zeros(rows * columns + 1, np.int32)
-    cell = np.empty(count, np.int32)
     for i in range(count):
         c = min(max(int(nodes_uv[i, 0] / bin_px), 0), columns - 1)
         r = min(max(int(nodes_uv[i, 1] / bin_px), 0), rows - 1)
         cell[i] = r * columns + c
-        starts[cell[i] + 1] += 1
+        starts[cell[i] + 2] += 1
     for b in range(rows * columns):
         starts[b + 1] += starts[b]
-    at = starts[:-1].copy()
-    number = np.empty(count, np.int32)
-    xyz = np.empty((3, count), np.float32)
+    # One place further than they belong; each moves to its own as its bin is filled.
     for i in range(count):
-        j = at[cell[i]]
-        at[cell[i]] += 1
+        j = starts[cell[i] + 1]
+        starts[cell[i] + 1] += 1
         number[j] = i
         for k in range(3):
             xyz[k, j] = nodes[i, k]
-    return starts, number, xyz
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz", "contract"})
@@ -220,14 +229,21 @@ def _find_two(first, end, rows, columns, seeds, nodes, winner, d2):  # type: ign
             d2[0, p], d2[1, p] = one, two
 
 
-@njit(cache=True, nogil=True)
-def _move(points, uv, winner, d2, nodes, nodes_uv, relocate):  # type: ignore[no-untyped-def]
+def _move(
+    points: Floats, uv: Floats, winner: Ints, d2: Floats, nodes: Floats, nodes_uv: Floats, relocate: bool
+) -> None:
     """Move nodes to the means of the seeds they won; relocate those that are of little use."""
     count = len(nodes)
-    sums = np.zeros((count, 6), np.float32)
-    error = np.zeros(count, np.float32)
-    utility = np.zeros(count, np.float32)
-    worst = np.full(count, -1, np.int32)
+    tally = np.zeros((count, 6), np.float32), np.zeros((2, count), np.float32), np.full(count, -1, np.int32)
+    _move_all(points, uv, winner, d2, nodes, nodes_uv, tally, relocate)
+
+
+@njit(cache=True, nogil=True)
+def _move_all(points, uv, winner, d2, nodes, nodes_uv, tally, relocate):  # type: ignore[no-untyped-def]
+    """`_move`, with room for what is added up: sums over each node's seeds, its error and utility, its worst seed."""
+    count = len(nodes)
+    sums, worth, worst = tally
+    error, utility = worth[0], worth[1]
     for p in range(len(points)):
         j = winner[p]
         for k in range(3):
@@ -250,7 +266,9 @@ def _move(points, uv, winner, d2, nodes, nodes_uv, relocate):  # type: ignore[no
         return
     # As many nodes of the lowest utility as there are errors that outweigh them: the level at
     # which the two counts meet, by bisection, needs no sorting.
-    low, high = np.float32(0), GAIN * error.max()
+    low = high = np.float32(0)
+    for j in range(count):
+        high = max(high, GAIN * error[j])
     for _ in range(24):
         level = np.float32(0.5) * (low + high)
         useless = 0

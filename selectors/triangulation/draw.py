@@ -76,7 +76,9 @@ def touch(touched: Bools, top: Whole, left: Whole, bottom: Whole, right: Whole) 
     touched[first_row, first_column] = touched[first_row, last_column] = True
     touched[last_row, first_column] = touched[last_row, last_column] = True
     if last_row - first_row > 1 or last_column - first_column > 1:
-        touched[first_row : last_row + 1, first_column : last_column + 1] = True
+        for row in range(first_row, last_row + 1):
+            for column in range(first_column, last_column + 1):
+                touched[row, column] = True
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -86,16 +88,18 @@ def _after(uv: Ints, a: int, b: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def _length_sq(uv: Ints, a: int, b: int) -> int:
+    """Squared length of an edge, pixels."""
+    du, dv = uv[a, 0] - uv[b, 0], uv[a, 1] - uv[b, 1]
+    return int(du * du + dv * dv)  # a power of whole numbers takes a quarter of a second to compile
+
+
+@njit(cache=True, nogil=True)
 def _bridges(uv: Ints, z_mm: Floats, a: int, b: int, c: int) -> bool:
     """Whether a triangle of three points spans a hole or a depth discontinuity."""
     if max(z_mm[a], z_mm[b], z_mm[c]) - min(z_mm[a], z_mm[b], z_mm[c]) <= STEP_MM:
         return False
-    longest = max(
-        (uv[a, 0] - uv[b, 0]) ** 2 + (uv[a, 1] - uv[b, 1]) ** 2,
-        (uv[b, 0] - uv[c, 0]) ** 2 + (uv[b, 1] - uv[c, 1]) ** 2,
-        (uv[c, 0] - uv[a, 0]) ** 2 + (uv[c, 1] - uv[a, 1]) ** 2,
-    )
-    return bool(longest > BRIDGE_PX * BRIDGE_PX)
+    return bool(max(_length_sq(uv, a, b), _length_sq(uv, b, c), _length_sq(uv, c, a)) > BRIDGE_PX * BRIDGE_PX)
 
 
 @njit(cache=True, nogil=True)
@@ -137,7 +141,7 @@ def sort_out(changed: Bools, uv: Ints, z_mm: Floats, tri: Ints, kind: Bytes, dra
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True)
 def _draw_edge(
     flat: Layers, width: int, uv: Ints, z_mm: Floats, a: int, b: int, plainly: bool, spread: np.float32
 ) -> None:
@@ -161,7 +165,7 @@ def _draw_edge(
             flat.spread_mm2[p] = spread
 
 
-@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+@njit(cache=True, nogil=True, inline="always")
 def _fill(flat: Layers, width: int, uv: Ints, z_mm: Floats, a: int, b: int, c: int, bridge: bool) -> np.float32:
     """Draw a triangle's inside, its right edges, and its upper one if that is level.
 
@@ -181,7 +185,8 @@ def _fill(flat: Layers, width: int, uv: Ints, z_mm: Floats, a: int, b: int, c: i
     z0, z01, z02 = np.float64(z_mm[a]), np.float64(z_mm[b] - z_mm[a]), np.float64(z_mm[c] - z_mm[a])
     along, down = (z01 * (v2 - v0) - z02 * (v1 - v0)) / area, (z02 * (u1 - u0) - z01 * (u2 - u0)) / area
     mean = (z_mm[a] + z_mm[b] + z_mm[c]) / np.float32(3)
-    spread = ((z_mm[a] - mean) ** 2 + (z_mm[b] - mean) ** 2 + (z_mm[c] - mean) ** 2) / np.float32(3)
+    off_a, off_b, off_c = z_mm[a] - mean, z_mm[b] - mean, z_mm[c] - mean
+    spread = (off_a * off_a + off_b * off_b + off_c * off_c) / np.float32(3)
     # Crossings are whole or at least 1 / height from it: a little more, and none is cut off.
     ac, ab, bc = (u2 - u0) / (v2 - v0), (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1)
     samples_mm, nearest, _, depth_mm, plain, spread_mm2, _ = flat
@@ -199,7 +204,7 @@ def _fill(flat: Layers, width: int, uv: Ints, z_mm: Floats, a: int, b: int, c: i
     return np.float32(spread)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True)
 def draw(first: int, end: int, drawn: Ints, flat: Layers, width: int, points: Points, mesh: Triangles) -> None:
     """Draw triangles into the model: those that bridge nothing linearly, the others not at all.
 

@@ -30,7 +30,7 @@ def _nearest_row_in_column(first: int, end: int, valid: Bools, nearest_row: Ints
                 nearest[k] = last[k] if abs(last[k] - v) < abs(nearest[k] - v) else nearest[k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True)
 def _nearest_along_rows(first: int, end: int, nearest_row: Ints, nearest: Ints, gap_sq: Ints) -> None:
     """Lower envelope of the columns' parabolas, row by row: the exact nearest sample."""
     width = nearest_row.shape[1]
@@ -42,7 +42,8 @@ def _nearest_along_rows(first: int, end: int, nearest_row: Ints, nearest: Ints, 
         for u in range(width):
             if nearest_row[v, u] == _FAR:
                 continue
-            g = (np.int64(nearest_row[v, u]) - v) ** 2
+            off = np.int64(nearest_row[v, u]) - v
+            g = off * off
             begin = np.int64(0)
             while top >= 0:
                 # First integer pixel at which column u beats the envelope's last column. The
