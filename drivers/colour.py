@@ -139,7 +139,9 @@ class Colouring:
         """The same, completed by what a source knows of its cameras."""
         return replace(self, intrinsics=self.intrinsics or intrinsics, place_mm=self.place_mm or place_mm)
 
-    def colour(self, frame: DepthFrame, colour: ColourArray, time_us: int, registered: bool) -> DepthFrame:
+    def colour(
+        self, frame: DepthFrame, colour: ColourArray, time_us: int, registered: bool, jpeg: bytes | None = None
+    ) -> DepthFrame:
         """A frame with its colour image, registered if it can be.
 
         Parameters
@@ -150,15 +152,19 @@ class Colouring:
             When it was taken.
         registered : bool
             Whether the source says that it lies on the depth image.
+        jpeg : bytes, optional
+            The file that it was read from.
         """
         height, width = colour.shape[:2]
         registered = registered if self.registered is None else self.registered
         camera = Camera(width, height, *self.intrinsics) if self.intrinsics else None
         if not registered and self.registered is None and camera and self.place_mm:
             colour = on_depth(frame.depth_mm, frame.camera, colour, camera, self.place_mm)
-            camera, registered = None, True
+            camera, registered, jpeg = None, True, None
         registered = registered and colour.shape[:2] == frame.shape
-        return replace(frame, colour=colour, colour_us=time_us, colour_camera=camera, registered=registered)
+        return replace(
+            frame, colour=colour, colour_us=time_us, colour_camera=camera, registered=registered, colour_jpeg=jpeg
+        )
 
 
 ON: Final = Colouring()

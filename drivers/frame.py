@@ -157,6 +157,9 @@ class DepthFrame:
     registered : bool
         Whether the colour image lies on the depth image, pixel on pixel. Told by the device, the
         layout, the sidecar or the user, never assumed.
+    colour_jpeg : bytes or None
+        The JPEG file that `colour` was read from, where it was: who hands the image on as one need
+        not make another, and loses nothing.
 
     Raises
     ------
@@ -174,6 +177,7 @@ class DepthFrame:
     colour_us: int | None = None
     colour_camera: Camera | None = None
     registered: bool = False
+    colour_jpeg: bytes | None = None
 
     def __post_init__(self) -> None:
         _check_image("depth_mm", self.depth_mm, np.uint16)

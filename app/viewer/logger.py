@@ -15,6 +15,7 @@ from selective_depth.app.pictures import palette
 from selective_depth.app.pipeline import STAGES, FrameResult, Model
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.blueprint import Shown, blueprint, epoch_blueprint
+from selective_depth.app.viewer.images import ImageLogger
 from selective_depth.drivers.colour import jpeg_of
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.selectors.arrays import pixels_where
@@ -29,6 +30,8 @@ USUAL_US = 33_333
 LINE_S = 0.5
 """How long the line that tells the gain stays at least, to be read."""
 JPEG_QUALITY = 80
+MOST_JPEG = 6
+"""A recording's own JPEG is logged as it is where it has a sixth of its image's bytes or less."""
 CLOUD_STEP = 3
 """The coloured cloud has every third pixel each way: all of them would be 5 MB a frame."""
 
@@ -47,6 +50,7 @@ class ResultLogger:
     def __init__(self, stream: rr.RecordingStream, options: ViewerOptions) -> None:
         self._stream = stream
         self._log = stream.log
+        self._images = ImageLogger(stream)
         self._options = options
         self._shown: Shown | None = None
         self._timestamp_us, self._elapsed_s, self._logged_s = 0, 0.0, 0.0
@@ -84,7 +88,7 @@ class ResultLogger:
         self._stream.send_recording_name(f"epochs of {frame.source}")
         self._log_camera(frame.camera)
         self._log_classes()
-        self._log_depth(frame.depth_mm, static=True)
+        self._log_frame(frame.depth_mm, static=True)
         for epoch, regions in trainings:
             self._stream.set_time("epoch", sequence=epoch)
             self._log_gas(regions, detail=True)
@@ -185,7 +189,7 @@ class ResultLogger:
 
     def _log_sensor(self, result: FrameResult) -> None:
         depth_mm, seeds = result.frame.depth_mm, result.seeds
-        self._log_depth(depth_mm)
+        self._log_frame(depth_mm)
         near, far = self._limits_mm
         level = np.clip((seeds.depth_mm.ravel() - near) * (255 / (far - near)), 0, 255)
         colours = np.where(seeds.valid.ravel(), DEPTH_COLOURS[level.astype(np.uint8)], np.uint32(palette.HOLE))
@@ -196,17 +200,21 @@ class ResultLogger:
         """The colour image, as JPEG: a twentieth of its bytes; where it lies on depth, a cloud in its colours."""
         if frame.colour is None:
             return
-        self._log("colour", rr.EncodedImage(contents=jpeg_of(frame.colour, JPEG_QUALITY), media_type="image/jpeg"))
+        jpeg = frame.colour_jpeg
+        if jpeg is None or len(jpeg) > frame.colour.size // MOST_JPEG:
+            jpeg = jpeg_of(frame.colour, JPEG_QUALITY)
+        self._log("colour", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         if frame.registered:
-            uv = pixels_where(frame.depth_mm[::CLOUD_STEP, ::CLOUD_STEP]) * CLOUD_STEP
-            points_m = frame.camera.points_mm(uv, frame.measure(uv)) * np.float32(0.001)
-            packed = frame.colour[uv[:, 1], uv[:, 0]] @ np.array((1 << 24, 1 << 16, 1 << 8), np.uint32) | np.uint32(255)
-            self._log("world/cloud", rr.Points3D(points_m, colors=packed, radii=-1.8))
+            every = slice(None, None, CLOUD_STEP), slice(None, None, CLOUD_STEP)
+            depth_mm, colours = frame.depth_mm[every], palette.packed(frame.colour[every])
+            known = depth_mm > 0
+            points_m = frame.camera.points_mm(pixels_where(known) * CLOUD_STEP, depth_mm[known]) * np.float32(0.001)
+            self._log("world/cloud", rr.Points3D(points_m, colors=colours[known], radii=-1.8))
 
     def _log_gas(self, regions: RegionSelection, detail: bool = False) -> None:
-        self._log("camera/gas/mask", rr.SegmentationImage(regions.mask.view(np.uint8)))
+        self._images.classes("camera/gas/mask", regions.mask.view(np.uint8))
         if detail:
-            self._log("camera/gas/complement", rr.SegmentationImage(regions.complement.astype(np.uint8) * 2))
+            self._images.classes("camera/gas/complement", regions.complement.astype(np.uint8) * np.uint8(2))
         nodes_uv, kept = regions.nodes_uv + CENTRE, regions.triangles[regions.kept]
         outlines = _closed_strips(nodes_uv[kept[:, (0, 1, 2, 0)]])
         self._log("camera/gas/triangles", rr.LineStrips2D(outlines, colors=palette.MESH, radii=0.35))
@@ -218,12 +226,12 @@ class ResultLogger:
 
     def _log_improvement(self, result: FrameResult, detail: bool) -> None:
         improvement, known = result.improvement, result.improvement.known
-        self._log("camera/improvement/score", _level_image(palette.IMPROVEMENT, improvement.score, known))
+        self._log_levels("camera/improvement/score", palette.IMPROVEMENT, improvement.score, known)
         if detail:
-            self._log("camera/improvement/unknown", rr.SegmentationImage((~known).view(np.uint8), opacity=1.0))
-            self._log("camera/improvement/estimate", self._depth_image(_as_depth(improvement.estimate_mm)))
+            self._images.classes("camera/improvement/unknown", (~known).view(np.uint8), opaque=True)
+            self._log_depth("camera/improvement/estimate", _as_depth(improvement.estimate_mm))
             deviation_mm = np.sqrt(np.where(known, improvement.variance_mm2, 0))
-            self._log("camera/errors/expected", _level_image(palette.ERROR, deviation_mm, known))
+            self._log_levels("camera/errors/expected", palette.ERROR, deviation_mm, known)
 
     def _log_acquisition(self, result: FrameResult) -> None:
         acquisition = result.acquisition
@@ -232,7 +240,7 @@ class ResultLogger:
         shot = acquisition.round > 0
         uv, depth_mm, rounds = (array[shot] for array in (acquisition.uv, acquisition.depth_mm, acquisition.round))
         colours = palette.round_colours(self._shown.rounds if self._shown else 0)[rounds]
-        self._log("camera/samples", rr.Points2D(uv + CENTRE, colors=colours, radii=0.9))
+        self._log("camera/samples", rr.Points2D(uv.astype(np.float32) + CENTRE, colors=colours, radii=0.9))
         hit = depth_mm > 0
         points_m = result.frame.camera.points_mm(uv[hit], depth_mm[hit]) * np.float32(0.001)
         self._log("world/samples", rr.Points3D(points_m, colors=colours[hit], radii=-1.5))
@@ -250,16 +258,17 @@ class ResultLogger:
         """
         for name, error, each in (("model", "selective", model), ("even", "even", model.even)):
             if each is not None:
-                self._log(f"camera/{name}", self._depth_image(_as_depth(each.depth_mm)))
-                self._log(f"camera/errors/{error}", _error_image(each, frame, to_truth))
+                self._log_depth(f"camera/{name}", _as_depth(each.depth_mm))
+                error_mm = _error_mm(each, frame, to_truth)
+                self._log_levels(f"camera/errors/{error}", palette.ERROR, error_mm, ~np.isnan(error_mm))
         if frame.truth_mm is not None:
-            self._log("camera/truth", self._depth_image(frame.truth_mm))
+            self._log_depth("camera/truth", frame.truth_mm)
 
     def _log_memory(self, memory: TemporalStep) -> None:
         """Age of what is known, fresh bright, and what was forgotten in this frame."""
-        self._log("camera/memory/age", _level_image(palette.AGE, memory.age_frames, memory.known))
+        self._log_levels("camera/memory/age", palette.AGE, memory.age_frames, memory.known)
         changed = np.zeros_like(memory.changed) if memory.restarted else memory.changed
-        self._log("camera/memory/changed", rr.SegmentationImage(changed.view(np.uint8)))
+        self._images.classes("camera/memory/changed", changed.view(np.uint8))
 
     def _log_figures(self, result: FrameResult) -> None:
         self._log("figures/stages", rr.Scalars([result.stages_ms.get(name, np.nan) for name in STAGES]))
@@ -267,14 +276,21 @@ class ResultLogger:
             if np.isfinite(value := result.figures.get(name, np.nan)):
                 self._log(f"figures/{name}", rr.Scalars(value))
 
-    def _log_depth(self, depth_mm: npt.NDArray[np.uint16], *, static: bool = False) -> None:
-        self._log("camera/depth", self._depth_image(depth_mm), static=static)
-        self._log("camera/holes", rr.SegmentationImage((depth_mm == 0).view(np.uint8), opacity=1.0), static=static)
+    def _log_frame(self, depth_mm: npt.NDArray[np.uint16], *, static: bool = False) -> None:
+        self._log_depth("camera/depth", depth_mm, static=static)
+        self._images.classes("camera/holes", (depth_mm == 0).view(np.uint8), opaque=True, static=static)
 
-    def _depth_image(self, depth_mm: npt.NDArray[np.uint16]) -> rr.DepthImage:
-        return rr.DepthImage(
-            depth_mm, meter=1000.0, colormap=palette.DEPTH_COLOURMAP, depth_range=list(self._limits_mm)
-        )
+    def _log_depth(self, entity: str, depth_mm: npt.NDArray[np.uint16], *, static: bool = False) -> None:
+        self._images.depth(entity, depth_mm, palette.DEPTH_COLOURMAP, self._limits_mm, static=static)
+
+    def _log_levels(
+        self, entity: str, scale: palette.Scale, values: npt.NDArray[np.generic], known: npt.NDArray[np.bool_]
+    ) -> None:
+        """Values on a scale as its levels 1..255, whose colours and meaning are classes; 0 where nothing is known.
+
+        So a map has colours that Rerun does not know, and takes a byte a pixel.
+        """
+        self._images.classes(entity, np.multiply(scale.levels(values), known, dtype=np.uint8), opaque=True)
 
 
 def _middle_m(depth_mm: npt.NDArray[np.uint16]) -> float:
@@ -284,27 +300,15 @@ def _middle_m(depth_mm: npt.NDArray[np.uint16]) -> float:
 
 
 def _as_depth(value_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
-    return np.where(value_mm > 0, value_mm, np.float32(0)).astype(np.uint16)
+    return np.fmax(value_mm, np.float32(0)).astype(np.uint16)  # NaN, too, is 0
 
 
-def _error_image(model: Model, frame: DepthFrame, to_truth: bool) -> rr.SegmentationImage:
+def _error_mm(model: Model, frame: DepthFrame, to_truth: bool) -> npt.NDArray[np.float32]:
     """How far a model is off from its own frame, or from the truth of a frame, if that is known."""
-    error_mm = model.error_mm
-    if to_truth and frame.truth_mm is not None:
-        seen = (frame.depth_mm > 0) & (frame.truth_mm > 0)
-        error_mm = np.where(seen, np.abs(model.depth_mm - frame.truth_mm), np.float32(np.nan))
-    return _level_image(palette.ERROR, error_mm, ~np.isnan(error_mm))
-
-
-def _level_image(
-    scale: palette.Scale, values: npt.NDArray[np.generic], known: npt.NDArray[np.bool_]
-) -> rr.SegmentationImage:
-    """Values on a scale as its levels 1..255, whose colours and meaning are classes; 0 where nothing is known.
-
-    So a map has colours that Rerun does not know, and takes a byte a pixel.
-    """
-    levels = cv2.convertScaleAbs(scale.place(values), alpha=254, beta=1)
-    return rr.SegmentationImage(np.multiply(levels, known, dtype=np.uint8), opacity=1.0)
+    if not to_truth or frame.truth_mm is None:
+        return model.error_mm
+    seen = (frame.depth_mm > 0) & (frame.truth_mm > 0)
+    return np.where(seen, np.abs(model.depth_mm - frame.truth_mm), np.float32(np.nan))
 
 
 def _png(image: palette.Image) -> rr.EncodedImage:

@@ -60,18 +60,22 @@ class OniColour:
 
     def read(self, file: BinaryIO, frame: OniFrame) -> ColourArray | None:
         """The image of a frame of the stream, the right way round; None if it is damaged."""
-        colour = rgb_of(read_payload(file, frame), self._kind, *self._size)
-        if colour is not None and frame.mirrored:
-            colour = colour[:, ::-1]
-        return colour
+        return self._image(read_payload(file, frame), frame)
+
+    def _image(self, payload: bytes, frame: OniFrame) -> ColourArray | None:
+        colour = rgb_of(payload, self._kind, *self._size)
+        return colour[:, ::-1] if colour is not None and frame.mirrored else colour
 
     def on(self, file: BinaryIO, frame: DepthFrame, colouring: Colouring) -> DepthFrame:
         """A depth frame with the colour nearest to it in time, where there is one near enough."""
         at = nearest(self._times_us, frame.timestamp_us) if colouring.wanted and self.node else None
         if at is None or self.node is None:
             return frame
-        colour = self.read(file, self.node.frames[at])
+        held = self.node.frames[at]
+        payload = read_payload(file, held)
+        colour = self._image(payload, held)
         if colour is None:
             return frame
+        jpeg = payload if self._kind == "JPEG" and not held.mirrored else None
         colouring = colouring.told_by(self.camera.intrinsics if self.camera else None)
-        return colouring.colour(frame, colour, self._times_us[at], self.registered)
+        return colouring.colour(frame, colour, self._times_us[at], self.registered, jpeg)

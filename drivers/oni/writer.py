@@ -232,14 +232,14 @@ class OniWriter:
             self._start_plain(first)
             payload = encode_depth(frame.depth_mm, self._codec)
         if frame.colour is not None:
-            self._write_colour(first, frame.colour, frame.colour_us or 0)
+            self._write_colour(first, frame.colour, frame.colour_us or 0, frame.colour_jpeg)
         self._writer.add_frame(1, since_us, payload)
 
-    def _write_colour(self, first: DepthFrame, colour: ColourArray, time_us: int) -> None:
+    def _write_colour(self, first: DepthFrame, colour: ColourArray, time_us: int, jpeg: bytes | None) -> None:
         fits = first.colour is not None and first.colour.shape == colour.shape
         if fits and (self._colour_us is None or time_us > self._colour_us):  # else it stands in the file already
             self._colour_us = time_us
-            self._writer.add_frame(2, time_us - self._first_us, jpeg_of(colour, JPEG_QUALITY))
+            self._writer.add_frame(2, time_us - self._first_us, jpeg or jpeg_of(colour, JPEG_QUALITY))
 
     def read_back(self) -> DepthArray | None:
         """The last frame as it stands in the file; None if it cannot be decoded."""

@@ -147,3 +147,22 @@ def test_the_real_recorders_jpeg(shared_cases: Path) -> None:
     with open_source(shared_cases / "oni" / "rgb_lossy.oni") as source:
         for frame in source:
             assert frame.colour is not None and frame.colour_us == frame.timestamp_us and not frame.registered
+
+
+def test_colour_that_is_a_jpeg_already_is_copied_without_loss(tmp_path: Path) -> None:
+    write_oni(tmp_path / "one.oni", frames(3, registered=True))
+    with open_source(tmp_path / "one.oni") as source:
+        first = list(source)
+    write_oni(tmp_path / "two.oni", first)
+    with open_source(tmp_path / "two.oni") as source:
+        for before, after in zip(first, source, strict=True):
+            assert before.colour_jpeg and before.colour_jpeg == after.colour_jpeg
+            assert before.colour is not None and after.colour is not None
+            np.testing.assert_array_equal(before.colour, after.colour)
+
+
+@pytest.mark.parametrize("option", ["colour=60,60,30,20,25,0,0", "colour=off"])
+def test_what_is_not_the_recorded_image_has_no_jpeg(tmp_path: Path, option: str) -> None:
+    write_oni(tmp_path / "x.oni", frames(1))
+    with open_source(f"{tmp_path / 'x.oni'}?{option}") as source:
+        assert source.read().colour_jpeg is None
