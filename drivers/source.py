@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from typing import Self
+from typing import Final, Self
 
 from selective_depth.drivers.errors import SourceEndedError, SourceError
 from selective_depth.drivers.frame import Camera, DepthFrame
+
+DEFAULT_FPS: Final = 30.0
+"""Frames per second where nothing is said."""
 
 
 class DepthSource(ABC):

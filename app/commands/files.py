@@ -23,6 +23,7 @@ from selective_depth.drivers.oni import OniReader, OniReport, OniWriter, inspect
 from selective_depth.drivers.open import open_source
 from selective_depth.drivers.options import parted
 from selective_depth.drivers.search import FILES
+from selective_depth.drivers.writer import FrameWriter
 
 MOST_PROBLEMS = 20
 LOOK_S = 600.0
@@ -185,7 +186,7 @@ def _export(source: str, out: Path, frames: int | None, progress: FrameProgress)
     return count
 
 
-def _writer(out: Path, fps: float) -> OniWriter | FolderWriter | BagWriter:
+def _writer(out: Path, fps: float) -> FrameWriter:
     ending = out.suffix.lower()
     if ending in BAGS:
         return BagWriter(out)

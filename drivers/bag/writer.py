@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from selective_depth.drivers.bag.optional import rosbags
 from selective_depth.drivers.errors import OutputError, unwritten
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.writer import FrameWriter
 
 TOPIC = "/camera/depth/image_rect_raw"
 ALIGNED = "/camera/aligned_depth_to_color/image_raw"
@@ -18,7 +19,7 @@ _FRAME = "camera_depth_optical_frame"
 _COLOUR_TOPIC = "/camera/color/image_raw"
 
 
-class BagWriter:
+class BagWriter(FrameWriter):
     """Writes frames as ``sensor_msgs/Image`` with their CameraInfo: depth as 16UC1 in millimetres, colour as rgb8.
 
     Where colour lies on depth, the topic's name says so, as RealSense's does.
@@ -108,13 +109,9 @@ class BagWriter:
         finally:
             shutil.rmtree(self._unborn, ignore_errors=True)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if isinstance(error, OutputError | ValueError):
-            self._count = 0  # a source that failed leaves what it gave; a writer, nothing
-        self.close()
+    def discard(self) -> None:
+        """Leave nothing: what was written has no name before `close`, and without a frame it gets none."""
+        self._count = 0
 
     def _put(self, topic: str, timestamp_us: int, message: Any, kind: str) -> None:
         if topic not in self._topics:

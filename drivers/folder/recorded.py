@@ -23,9 +23,9 @@ from selective_depth.drivers.folder.cameras import CameraFile, find_camera_file
 from selective_depth.drivers.folder.colours import Colours
 from selective_depth.drivers.folder.images import damaged, read_raw, read_size, read_stack
 from selective_depth.drivers.folder.layouts import ARRAYS, Found, doubtful_order, find_layout
-from selective_depth.drivers.folder.sidecar import DEFAULT_FPS, MILLIMETRES, SIDECAR, Sidecar, read_sidecar
+from selective_depth.drivers.folder.sidecar import MILLIMETRES, SIDECAR, Sidecar, read_sidecar
 from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame, millimetres
-from selective_depth.drivers.source import DepthSource
+from selective_depth.drivers.source import DEFAULT_FPS, DepthSource
 
 _LOOKS: Final = 5
 """Frames that are looked at before a scale that is merely usual is believed."""

@@ -44,7 +44,6 @@ SIDECAR: Final = "frames.toml"
 SCHEMA: Final = 1
 MILLIMETRES: Final = 1000.0
 """Values per metre, where nothing is said."""
-DEFAULT_FPS: Final = 30.0
 
 _MAX_TEXT_BYTES: Final = 16 * 1024 * 1024
 

@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, Self
+from typing import Final
 
 import cv2
 
-from selective_depth.drivers.errors import OutputError
+from selective_depth.drivers.errors import OutputError, unwritten
 from selective_depth.drivers.folder.images import write_png
-from selective_depth.drivers.folder.sidecar import DEFAULT_FPS, MILLIMETRES, SIDECAR, Sidecar, write_sidecar
+from selective_depth.drivers.folder.sidecar import MILLIMETRES, SIDECAR, Sidecar, write_sidecar
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.source import DepthSource
+from selective_depth.drivers.source import DEFAULT_FPS
+from selective_depth.drivers.writer import FrameWriter, rate_of
 
 COLOUR: Final = "colour"
 
 
-class FolderWriter:
+class FolderWriter(FrameWriter):
     """Writes frames as a plain folder: ``000000.png`` …, colour in ``colour/``, and the sidecar.
 
     The sidecar is there from the first frame on and complete after `close`, so that what a killed
-    program leaves can be read. As a context manager it leaves
-    nothing where writing failed.
+    program leaves can be read.
 
     Parameters
     ----------
@@ -48,9 +48,11 @@ class FolderWriter:
         self._timestamps_us: list[int] = []
         self._colour_us: list[int] = []
         self._made = not self.path.exists()
-        with _writing(self.path):
+        try:
             self.path.mkdir(parents=True, exist_ok=True)
             used = any(entry.suffix.lower() == ".png" or entry.name == SIDECAR for entry in self.path.iterdir())
+        except OSError as error:
+            raise unwritten(self.path, error) from error
         if used:
             raise OutputError(f"'{self.path}' holds frames already; give a new or an empty folder.")
 
@@ -76,18 +78,17 @@ class FolderWriter:
             camera = None if frame.registered else frame.colour_camera
             self._sidecar = replace(self._sidecar, colour_registered=frame.registered, colour_camera=camera)
         depth, colour = self._files(len(self._timestamps_us))
-        with _writing(depth):
-            try:
-                write_png(depth, frame.depth_mm, self._compression)
-                if frame.colour is not None:
-                    colour.parent.mkdir(exist_ok=True)
-                    # Lossless, and as quick as it can be: noise hardly packs.
-                    write_png(colour, cv2.cvtColor(frame.colour, cv2.COLOR_RGB2BGR), 1)
-            except OSError:
-                # Half a file would make the whole folder unreadable.
-                depth.unlink(missing_ok=True)
-                colour.unlink(missing_ok=True)
-                raise
+        try:
+            write_png(depth, frame.depth_mm, self._compression)
+            if frame.colour is not None:
+                colour.parent.mkdir(exist_ok=True)
+                # Lossless, and as quick as it can be: noise hardly packs.
+                write_png(colour, cv2.cvtColor(frame.colour, cv2.COLOR_RGB2BGR), 1)
+        except OSError as error:
+            # Half a file would make the whole folder unreadable.
+            depth.unlink(missing_ok=True)
+            colour.unlink(missing_ok=True)
+            raise unwritten(depth, error) from error
         self._timestamps_us.append(frame.timestamp_us)
         self._colour_us.append(frame.colour_us or 0)
 
@@ -113,22 +114,16 @@ class FolderWriter:
             if self._made:
                 self.path.rmdir()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if isinstance(error, OutputError | ValueError):
-            self.discard()  # a source that failed leaves what it gave; a writer, nothing
-        self.close()
-
     def _files(self, index: int) -> tuple[Path, Path]:
         """Where a frame's depth and colour go."""
         name = f"{index:06d}.png"
         return self.path / name, self.path / COLOUR / name
 
     def _write_sidecar(self) -> None:
-        with _writing(self.path / SIDECAR):
+        try:
             write_sidecar(self.path, self._sidecar)
+        except OSError as error:
+            raise unwritten(self.path / SIDECAR, error) from error
 
 
 def write_folder(
@@ -157,23 +152,4 @@ def write_folder(
     OutputError
         If the folder cannot be written.
     """
-    if fps is None:
-        fps = frames.fps if isinstance(frames, DepthSource) else DEFAULT_FPS
-    count = 0
-    with FolderWriter(path, fps=fps, compression=compression) as folder:
-        for frame in frames:
-            folder.write(frame)
-            count += 1
-    return count
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Give what the system does not let us write the name of `OutputError`."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(
-            f"'{path}' cannot be written ({error.strerror}); check the folder's permissions and the"
-            " free space, or choose another folder."
-        ) from error
+    return FolderWriter(path, fps=rate_of(frames, fps), compression=compression).write_all(frames)

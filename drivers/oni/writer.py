@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO, Final, Self
+from typing import BinaryIO, Final
 
 from selective_depth.drivers.colour import jpeg_of
 from selective_depth.drivers.errors import OutputError, unwritten
@@ -42,14 +42,14 @@ from selective_depth.drivers.oni.records import (
     pack_property,
     pack_record,
 )
-from selective_depth.drivers.source import DepthSource
+from selective_depth.drivers.source import DEFAULT_FPS
+from selective_depth.drivers.writer import FrameWriter, rate_of
 
 _MAX_DEPTH_MM: Final = 65535
 _DEPTH_1_MM: Final = 100  # OpenNI2's number of this pixel format
 _GREY_16_BIT: Final = 4  # and OpenNI 1's
 _RGB_888: Final = 200
 _RGB_24_BIT: Final = 1
-_DEFAULT_FPS: Final = 30.0
 JPEG_QUALITY: Final = 92
 """Of recorded colour: it is off by less than its sensor's noise."""
 
@@ -167,7 +167,7 @@ class RecordWriter:
             raise unwritten(self.path, error) from error
 
 
-class OniWriter:
+class OniWriter(FrameWriter):
     """Writes frames to an .oni file that OpenNI2 replays, depth bit by bit, colour as JPEG.
 
     It holds colour if the first frame has any, and of a later one only an image of the same size.
@@ -193,7 +193,7 @@ class OniWriter:
     more different depths than that can say: then the file is written anew without.
     """
 
-    def __init__(self, path: str | Path, *, fps: float = _DEFAULT_FPS, keep: bool = False) -> None:
+    def __init__(self, path: str | Path, *, fps: float = DEFAULT_FPS, keep: bool = False) -> None:
         self._fps = fps
         self._keep = keep
         self._first: DepthFrame | None = None
@@ -251,16 +251,12 @@ class OniWriter:
     def close(self) -> None:
         """Finish the file; without a frame there is none."""
         if self._first is None:
-            self._writer.discard()
+            self.discard()
         self._writer.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if isinstance(error, OutputError | ValueError):
-            self._writer.discard()  # a source that failed leaves what it gave; a writer, nothing
-        self.close()
+    def discard(self) -> None:
+        """Remove the file."""
+        self._writer.discard()
 
     def _begin(self, first: DepthFrame) -> DepthFrame:
         camera = first.camera
@@ -328,14 +324,7 @@ def write_oni(path: str | Path, frames: Iterable[DepthFrame], *, fps: float | No
     OutputError
         If the file exists or cannot be written.
     """
-    if fps is None:
-        fps = frames.fps if isinstance(frames, DepthSource) else _DEFAULT_FPS
-    count = 0
-    with OniWriter(path, fps=fps) as recording:
-        for frame in frames:
-            recording.write(frame)
-            count += 1
-    return count
+    return OniWriter(path, fps=rate_of(frames, fps)).write_all(frames)
 
 
 def depth_properties(camera: Camera, fps: float) -> dict[str, Property]:
