@@ -17,7 +17,7 @@ import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NoReturn
 
 VARIABLE = "NUMBA_CACHE_DIR"
 _DIGEST = hashlib.sha256().digest_size
@@ -65,15 +65,26 @@ settle_cache()
 
 from numba import njit as compiled  # noqa: E402 - after the folder is settled
 from numba.core.caching import FunctionCache, IndexDataCacheFile  # noqa: E402
+from numba.core.registry import CPUDispatcher  # noqa: E402
 
 
-def _njit(*, cache: bool = False, **options: Any) -> Any:
+class _Inner(CPUDispatcher):
+    def __call__(self, *_: object, **__: object) -> NoReturn:
+        raise TypeError(
+            f"'{self.py_func.__name__}' is compiled for other kernels to call; from Python, take its py_func."
+        )
+
+
+def njit(*, cache: bool = False, inner: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Numba's `njit`, but for a cache that mends itself.
 
     Parameters
     ----------
     cache : bool, default False
         Keep what is compiled on disk, for the next run.
+    inner : bool, default False
+        Only other kernels call it. What Python needs to call one takes a twentieth of a second to
+        compile, and of one that takes tuples of arrays several times as long.
     **options
         As for `numba.njit`.
     """
@@ -81,8 +92,10 @@ def _njit(*, cache: bool = False, **options: Any) -> Any:
     def decorate(function: Callable[..., Any]) -> Any:
         # No kernel is called from C: a wrapper for that is a twelfth of the time to compile. Nor does
         # one look for divisions by zero, which keep loops from being vectorised.
-        options.update(no_cfunc_wrapper=True, error_model="numpy")
+        options.update(no_cfunc_wrapper=True, no_cpython_wrapper=inner, error_model="numpy")
         dispatcher: Any = compiled(**options)(function)
+        if inner and isinstance(dispatcher, CPUDispatcher):  # without the wrapper, a call would end the process
+            dispatcher.__class__ = _Inner
         try:
             if cache:
                 dispatcher._cache = _MendingCache(function)
@@ -94,12 +107,6 @@ def _njit(*, cache: bool = False, **options: Any) -> Any:
         return dispatcher
 
     return decorate
-
-
-if TYPE_CHECKING:  # it takes what Numba's own takes
-    from numba import njit as njit
-else:
-    njit = _njit
 
 
 class _CheckedFile(IndexDataCacheFile):

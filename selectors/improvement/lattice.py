@@ -39,7 +39,7 @@ def lattice_scratch(most_pixels: int) -> tuple[Floats, ...]:
     )
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, inner=True, forceinline=True, nogil=True, fastmath={"contract"})
 def krige_lanes(padded, i, order, batch, geometry, sides, tables, scratch, strip):  # type: ignore[no-untyped-def]
     """Krige the windows of lattice row `i` in batch number `batch`.
 
@@ -139,7 +139,7 @@ def krige_lanes(padded, i, order, batch, geometry, sides, tables, scratch, strip
                 improvement_out[n] = kept * inverse[p, n] + around / max(kept, tiny)
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, inner=True, forceinline=True, nogil=True, fastmath={"contract"})
 def _fit_lanes(padded, i, order, batch, tables, geometry, s):  # type: ignore[no-untyped-def]
     """Gather the depths, fit (a, b) and weigh the contrasts of each lane."""
     basis, eigenvalues = tables.basis[geometry], tables.eigenvalues[geometry]

@@ -20,7 +20,7 @@ BLOCK = 64
 ONE = np.int32(1)
 
 
-@njit(cache=True, forceinline=True, nogil=True)
+@njit(cache=True, inner=True, forceinline=True, nogil=True)
 def gather_seeds(padded, rows, columns, i, j, samples):  # type: ignore[no-untyped-def]
     """Collect the seeds of the window about lattice point (i, j), the centre first.
 
@@ -111,7 +111,7 @@ def krige_row(i, padded, lattice, frame_shape, scratch, strip, held):  # type: i
                 strip[2, row, column, at] = improvement[p]
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, inner=True, forceinline=True, nogil=True, fastmath={"contract"})
 def blend_down(  # type: ignore[no-untyped-def]
     share_one, one, row_one, held_one, share_other, other, row_other, held_other, mixed, held
 ):
@@ -134,7 +134,7 @@ def blend_down(  # type: ignore[no-untyped-def]
                 into[k] = weight_one[k] * here[k] + weight_other[k] * there[k]
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, inner=True, forceinline=True, nogil=True, fastmath={"contract"})
 def blend_across(columns, places, mixed, held, estimate, variance, raw):  # type: ignore[no-untyped-def]
     """Blend one pixel row across from the windows left and right of each pixel."""
     first_weight, second_weight = columns.first_weight, columns.second_weight
@@ -168,7 +168,7 @@ def doubtful_cells(padded: Floats, windows: Windows) -> Bytes:
     return np.where((corners >= 2) & windows.small, 0, np.where(near, 1, 2)).astype(np.uint8)
 
 
-@njit(cache=True, forceinline=True, nogil=True)
+@njit(cache=True, inner=True, forceinline=True, nogil=True)
 def mark_known(y, padded, doubtful, lattice, held, line):  # type: ignore[no-untyped-def]
     """Tell known pixels of row y from those too far from every seed, and clear the latter.
 

@@ -148,7 +148,7 @@ def _gather(measured, spiral, row, column, up, down, left, right, samples):  # t
     return count
 
 
-@njit(cache=True, forceinline=True, nogil=True)
+@njit(cache=True, inner=True, forceinline=True, nogil=True)
 def _near_sample(measured, spiral, y, x, reach_squared):  # type: ignore[no-untyped-def]
     height, width = measured.shape
     for n in range(len(spiral)):

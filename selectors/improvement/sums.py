@@ -28,7 +28,7 @@ MOMENTS_NUGGET = 3.0
 At w = 1.999 it is then within .1 % of eq. (13), whose terms of h^w - h^2 it leaves out."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True, nogil=True)
 def _whiten(values, count, L, out):  # type: ignore[no-untyped-def]
     """L^-1 of the differences of `count` values to the first one before them."""
     for i in range(count):
@@ -38,7 +38,7 @@ def _whiten(values, count, L, out):  # type: ignore[no-untyped-def]
         out[i] = residual * L[i, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inner=True, nogil=True)
 def improve_by_sums(samples, count, a, b, box, scratch):  # type: ignore[no-untyped-def]
     """Take eq. (27), its misprint mended, for the improvement of a window that is kriged already.
 

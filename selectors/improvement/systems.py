@@ -102,7 +102,7 @@ def sample_buffers() -> tuple[npt.NDArray[Any], ...]:
     return whole, whole.copy(), np.zeros(MAX_SAMPLES, np.float32), whole.copy()
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, inner=True, forceinline=True, nogil=True, fastmath={"contract"})
 def _factor(z, row_of, count, a, b, between, L, y):  # type: ignore[no-untyped-def]
     """Cholesky factor of the differences to sample 0, and the depths' differences solved by it.
 
@@ -129,7 +129,7 @@ def _factor(z, row_of, count, a, b, between, L, y):  # type: ignore[no-untyped-d
         y[i] = residual * L[i, i]
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, inner=True, forceinline=True, nogil=True, fastmath={"contract"})
 def _subtract_block(block, earlier, rows, k, pixels):  # type: ignore[no-untyped-def]
     """Take the part of an earlier block of U out of a later one: U -= L U_earlier."""
     f00, f01, f02, f03 = rows[0, k], rows[0, k + 1], rows[0, k + 2], rows[0, k + 3]
@@ -149,7 +149,7 @@ def _subtract_block(block, earlier, rows, k, pixels):  # type: ignore[no-untyped
         block[3 * STRIDE + p] -= g30 * e0 + g31 * e1 + g32 * e2 + g33 * e3
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, inner=True, forceinline=True, nogil=True, fastmath={"contract"})
 def _solve_block(block, corner, pixels):  # type: ignore[no-untyped-def]
     """Solve a block of U by its own corner of L, whose diagonal is inverted."""
     d0, d1, d2 = np.float32(corner[0, 0]), np.float32(corner[1, 1]), np.float32(corner[2, 2])
@@ -166,7 +166,7 @@ def _solve_block(block, corner, pixels):  # type: ignore[no-untyped-def]
         block[2 * STRIDE + p] = r2
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, inner=True, forceinline=True, nogil=True, fastmath={"contract"})
 def krige_window(  # type: ignore[no-untyped-def]
     samples, count, a, b, between, distances, first, box, frame_shape, scratch
 ):
@@ -259,7 +259,7 @@ def krige_window(  # type: ignore[no-untyped-def]
             improvement[p] = np.float32(0.0)
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, inner=True, forceinline=True, nogil=True, fastmath={"contract"})
 def _settle(samples, count, box, frame_shape, scratch):  # type: ignore[no-untyped-def]
     """Raise estimates and variances to what they may be at least, and invert the former.
 
@@ -292,7 +292,7 @@ def _settle(samples, count, box, frame_shape, scratch):  # type: ignore[no-untyp
             inverse[row * stride + column] = np.float32(0.0)
 
 
-@njit(cache=True, forceinline=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, inner=True, forceinline=True, nogil=True, fastmath={"contract"})
 def _improve(box, scratch):  # type: ignore[no-untyped-def]
     """Eq. (23) from inverted estimates, variances and the covariances of neighbours."""
     variance, improvement, inverse, right, below = scratch[1:6]

@@ -50,7 +50,7 @@ def in_disk(uv: Ints, a: int, b: int, c: int, p: Whole) -> bool:
         elif b == GHOST:
             a, b = c, a
         # The circle through infinity is the half-plane left of ab, and the open segment ab.
-        side = orient(uv, a, b, p)
+        side: int = orient(uv, a, b, p)
         if side != 0:
             return side > 0
         pu, pv = np.int64(uv[p, 0]), np.int64(uv[p, 1])

@@ -18,7 +18,7 @@ import numba
 import pytest
 
 from selective_depth.drivers import kernels
-from selective_depth.drivers.kernels import VARIABLE, settle_cache
+from selective_depth.drivers.kernels import VARIABLE, njit, settle_cache
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX permissions")
 
@@ -233,3 +233,25 @@ def test_the_share_of_kernels_that_are_kept_tells_a_first_run(tmp_path: Path) ->
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment
     ).stdout.split()
     assert float(done[0]) == 0 < float(done[1])
+
+
+def test_an_inner_kernel_is_called_by_kernels_only() -> None:
+    @njit(inner=True)
+    def half(number):
+        return number / 2
+
+    @njit()
+    def quarter(number):
+        return half(half(number))
+
+    assert quarter(3.0) == half.py_func(1.5) == 0.75
+    with pytest.raises(TypeError, match="'half' is compiled for other kernels"):
+        half(3.0)
+
+
+def test_without_a_compiler_an_inner_kernel_is_a_function() -> None:
+    code = "from selective_depth.drivers.kernels import njit; print(njit(inner=True)(lambda x: 2 * x)(-1))"
+    run = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "NUMBA_DISABLE_JIT": "1"}, capture_output=True
+    )
+    assert run.stdout.strip() == b"-2", run.stderr

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_kriging import direct_improvement, gamma, krige
 
+from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.improvement.lattice_tables import build_tables
 from selective_depth.selectors.improvement.sums import MOMENTS_NUGGET, improve_by_sums
 from selective_depth.selectors.improvement.systems import (
@@ -21,6 +22,13 @@ from selective_depth.selectors.improvement.systems import (
 from selective_depth.selectors.improvement.variogram import fit_moments, fit_samples, power_table
 
 FRAME = (480, 640)
+
+
+@njit()
+def krige_or_sum(samples, count, a, b, between, distances, box, scratch, by_sums):  # only kernels call those
+    krige_window(samples, count, a, b, between, distances, 0, box, FRAME, scratch)
+    if by_sums:
+        improve_by_sums(samples, count, a, b, box, scratch)
 
 
 def window(uv, depth, a, b, w, u0, v0, width, height, by_sums=False):
@@ -40,9 +48,7 @@ def window(uv, depth, a, b, w, u0, v0, width, height, by_sums=False):
         distances[n, : line.size] = line
     scratch = window_scratch(room)
     box = Box(u0, v0, width, height)
-    krige_window(samples, count, a, b, between, distances, 0, box, FRAME, scratch)
-    if by_sums:
-        improve_by_sums(samples, count, a, b, box, scratch)
+    krige_or_sum(samples, count, a, b, between, distances, box, scratch, by_sums)
     size = (height + 2) * (width + 2)
     return [scratch[q][:size].reshape(height + 2, width + 2)[1:-1, 1:-1].astype(float) for q in range(3)]
 
