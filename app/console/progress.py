@@ -7,10 +7,11 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Self
+from typing import Self
 
 from rich import progress
-from rich.console import Console, RenderableType
+from rich.console import Console, Group
+from rich.live import Live
 from rich.text import Text
 
 PATIENCE_S = 2.0
@@ -32,20 +33,6 @@ def waiting(why: str) -> Iterator[None]:
         timer.cancel()
 
 
-class _Bar(progress.Progress):
-    """A progress bar with a line below it."""
-
-    def __init__(self, *columns: progress.ProgressColumn, hint: str, **options: Any) -> None:
-        self._hint = hint
-        super().__init__(*columns, **options)
-
-    def get_renderables(self) -> Iterator[RenderableType]:
-        """The bar, and the line."""
-        yield from super().get_renderables()
-        if self._hint:
-            yield Text(self._hint, style="dim")
-
-
 class FrameProgress:
     """How far a run has come: a bar on a terminal, now and then a line elsewhere.
 
@@ -63,7 +50,7 @@ class FrameProgress:
         self._what, self._total = what, total
         self._start_s = self._said_s = time.monotonic()
         self._drawn = sys.stderr.isatty()
-        self._bar = _Bar(
+        self._bar = progress.Progress(
             progress.SpinnerColumn(),
             progress.TextColumn("{task.description}"),
             *((progress.BarColumn(),) if total else ()),
@@ -71,12 +58,10 @@ class FrameProgress:
             progress.TextColumn("frames"),
             progress.TimeElapsedColumn(),
             progress.TextColumn("{task.fields[note]}"),
-            console=Console(stderr=True),
-            transient=True,
-            hint=hint,
-            disable=not self._drawn,
         )
         self._task = self._bar.add_task(what, total=total, note="")
+        below = [Text(hint, style="dim")] if hint else []
+        self._live = Live(Group(self._bar, *below), console=Console(stderr=True), refresh_per_second=10, transient=True)
 
     def update(self, frames: int, note: str = "") -> None:
         """Show the number of frames done and a note, such as the sensor's state."""
@@ -90,12 +75,12 @@ class FrameProgress:
 
     def say(self, sentence: str) -> None:
         """Tell something at once, above the bar."""
-        self._bar.console.print(sentence, markup=False, highlight=False, soft_wrap=not self._drawn)
+        self._live.console.print(sentence, markup=False, highlight=False, soft_wrap=not self._drawn)
 
     def __enter__(self) -> Self:
-        self._bar.start()
+        if self._drawn:
+            self._live.start(refresh=True)
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if self._drawn:  # else it would end a line that it has not begun
-            self._bar.stop()
+        self._live.stop()
