@@ -34,13 +34,12 @@ FIRST_POINTS, FIRST_NODES = 4200, 45 * 50
 """Size of the first scan and of the map of Fig. 1."""
 DENSITIES = (32, 40, 64, 75)
 """Sides of the first scans of Fig. 2."""
-METRICS: tuple[EdgeMetric, EdgeMetric] = ("3d", "image")
 TABLE_NODES = (700, 1400, 2800, 5600)
 TABLE_EPOCHS = (5, 10, 20, 50, 100)
 PAPERS_SECONDS = {"workstation": (153.0, 1.39), "ball": (153.9, 1.41), "firehose": (150.0, 1.41)}
 """Table 1: neural gas (Matlab) and improvement map (C++, i7-2630) on its scenes of these names."""
 
-_NAMES = {"3d": "edges short in space", "image": "edges short in the image"}
+_METRICS: dict[EdgeMetric, str] = {"3d": "edges short in space", "image": "edges short in the image"}
 
 
 def object_seeds(frame: DepthFrame, points: int) -> SeedGrid:
@@ -98,7 +97,7 @@ def by_metric(chosen: RegionSelection) -> dict[EdgeMetric, RegionSelection]:
         metric: delaunay_regions(
             chosen.nodes_mm, chosen.nodes_uv, chosen.mask.shape, edge_metric=metric, quantisation_error_mm=error_mm
         )
-        for metric in METRICS
+        for metric in _METRICS
     }
 
 
@@ -164,7 +163,7 @@ def _figure(
     """The object, then a column per training: nodes above, kept triangles by each metric below."""
     ground = panels.backdrop(frame)
     nodes: list[Panel | None] = [panels.shaded_panel(frame, "Object", note)]
-    kept: dict[EdgeMetric, list[Panel | None]] = {metric: [None] for metric in METRICS}
+    kept: dict[EdgeMetric, list[Panel | None]] = {metric: [None] for metric in _METRICS}
     for title, words, by_metrics in columns:
         stem = re.sub(r"\W+", "-", title)
         drawn = partial(panels.draw_nodes, regions=by_metrics["3d"])
@@ -175,7 +174,7 @@ def _figure(
             kept[metric].append(Panel(f"kept-{metric}-{stem}", title, image, note=share, overlay=drawn))
     return [
         ("Nodes of the neural gas", nodes),
-        *((f"Triangles kept: {_NAMES[metric]}", row) for metric, row in kept.items()),
+        *((f"Triangles kept: {_METRICS[metric]}", row) for metric, row in kept.items()),
     ]
 
 
