@@ -45,8 +45,7 @@ def watch(uri: str, settings: Settings) -> int:
 def run_with_keys(session: Session) -> int:
     """Run a session, which keys of the terminal steer, and print its report; returns the exit code."""
     with pressed(session.steering.press) as keys:
-        session.help = KEYS if keys else ""
-        code = session.run()
+        code = session.run(KEYS if keys else "")
     print_report(session.report)
     return code
 

@@ -84,8 +84,6 @@ class Session:
     prepare : callable
         Called with pipeline and first frame before the second is read: `Pipeline.warm_up`, and whatever else
         is to be ready then.
-    help : str
-        What is shown beside the progress.
     """
 
     def __init__(self, uri: str, settings: Settings, steering: Steering | None = None) -> None:
@@ -93,7 +91,6 @@ class Session:
         self.steering = steering or Steering()
         self.report = RunReport(uri, live=False)
         self.prepare: Callable[[Pipeline, DepthFrame], FrameResult] = Pipeline.warm_up
-        self.help = ""
         self._uri = uri
         self.last: FrameResult | None = None
         self._code = OK
@@ -110,8 +107,13 @@ class Session:
         self._progress: FrameProgress
         self._went_by = 0  # frames that a sensor made while the run was paused
 
-    def run(self) -> int:
+    def run(self, hint: str = "") -> int:
         """Run to the end of the source, the asked number of frames, or Ctrl-C.
+
+        Parameters
+        ----------
+        hint : str, optional
+            What is shown beside the progress: the keys that there are.
 
         Returns
         -------
@@ -139,7 +141,7 @@ class Session:
                 self._table = stack.enter_context(writing(seen.table, {"source": self._uri}))
             viewer = self._viewer = self._open_viewer(frames)
             try:
-                with interrupt.recognised(), FrameProgress(self._uri, frames, self.help) as self._progress:
+                with interrupt.recognised(), FrameProgress(self._uri, frames, hint) as self._progress:
                     self._flow()
                 if viewer.served_url and not sensor and not self.steering.stopped:
                     say("All frames are served; Ctrl-C ends.")
