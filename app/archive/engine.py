@@ -71,32 +71,33 @@ def engine(scheduler: str | None = None, workers: int | None = None) -> Iterator
         from distributed import Client
     with dask.config.set(_QUIET):
         if scheduler is not None:
-            with _there(scheduler) as client:
-                yield client
-            return
-        with interrupt.started_deaf(), waiting("Starting the workers"):
-            client = Client(
-                n_workers=workers or default_threads(),
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",
-                env={"SELECTIVE_DEPTH_THREADS": "1"},
-            )
+            client = _there(scheduler)
+        else:
+            with interrupt.started_deaf(), waiting("Starting the workers"):
+                client = Client(
+                    n_workers=workers or default_threads(),
+                    threads_per_worker=1,
+                    processes=True,
+                    host="127.0.0.1",
+                    dashboard_address="127.0.0.1:0",
+                    env={"SELECTIVE_DEPTH_THREADS": "1"},
+                )
         done = False
         try:
             yield client
             done = True
         finally:
-            if done:
+            if scheduler is not None:
+                client.close(timeout=1)
+            elif done:
                 client.close()
             else:  # after Ctrl-C, say: what is under way is not waited for
                 for process in multiprocessing.active_children():
                     process.kill()
 
 
-@contextmanager
-def _there(scheduler: str) -> Iterator[Client]:
+def _there(scheduler: str) -> Client:
+    """A client of a cluster that is there."""
     from distributed import Client
 
     file = Path(scheduler).is_file()
@@ -106,13 +107,9 @@ def _there(scheduler: str) -> Iterator[Client]:
             " 'dask scheduler --scheduler-file FILE' writes."
         )
     try:
-        client = Client(**({"scheduler_file": scheduler} if file else {"address": scheduler}))
+        return Client(**({"scheduler_file": scheduler} if file else {"address": scheduler}))
     except (OSError, ValueError) as error:
         raise AppError(f"no scheduler answers at '{scheduler}' ({error}); start one with 'dask scheduler'.") from error
-    try:
-        yield client
-    finally:
-        client.close(timeout=1)
 
 
 def dashboard(client: Client) -> str:
