@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.app.commands.snapshot import draw_snapshot, is_folder, nth_frame, short_name, tell_of, write_all
+from selective_depth.app.commands.snapshot import draw_snapshot, is_folder, nth_frame, short_name, write_all
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import OK
@@ -217,7 +217,7 @@ def draw_figure(
             (f"{stem[:-1]}, frame {frame}", (panels.shaded_panel(shown), panels.depth_panel(shown)))
             for stem, shown in zip(stems, frames, strict=True)
         ]
-    tell_of(write_all(path, f"figure-{number}", rows, stems or [""] * len(rows), page, legend=False))
+    write_all(path, f"figure-{number}", rows, stems or [""] * len(rows), page, legend=False)
     if save is not None and trained:
         from selective_depth.app.viewer import save_trainings
 

@@ -71,7 +71,7 @@ def is_folder(out: Path) -> bool:
 def write_all(
     out: Path, name: str, rows: Sequence[Row], stems: Sequence[str], page: PanelOptions, *, legend: bool = True
 ) -> list[Path]:
-    """Write a sheet; into a folder, with every panel of it alone beside it.
+    """Write a sheet; into a folder, with every panel of it alone beside it. Says what was written.
 
     Parameters
     ----------
@@ -101,6 +101,8 @@ def write_all(
             written.append(out / f"{stem}{panel.name}.{page.format}")
             figure = alone(panel) if page.bare else sheet([(title, [panel])], page.panel_width, legend=legend)
             write_picture(written[-1], figure, page.dpi)
+    beside = f" and {len(written) - 1} single panels beside it" if written[1:] else ""
+    say(f"wrote {written[0]}{beside}")
     return written
 
 
@@ -145,17 +147,10 @@ def snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings,
 
 
 def draw_snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings, page: PanelOptions) -> int:
-    """Make a `snapshot` and say what was written; returns the exit code."""
+    """Make a `snapshot`; returns the exit code."""
     with waiting("Running both selectors"):
-        written = snapshot(sources, number, out, settings, page)
-    tell_of(written)
+        snapshot(sources, number, out, settings, page)
     return OK
-
-
-def tell_of(written: Sequence[Path]) -> None:
-    """Say what `write_all` wrote."""
-    beside = f" and {len(written) - 1} single panels beside it" if written[1:] else ""
-    say(f"wrote {written[0]}{beside}")
 
 
 def take_screenshot(
