@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from timeit import timeit
 from typing import NamedTuple
 
 import numpy as np
@@ -236,11 +237,7 @@ def print_times(sources: Sequence[str], frame: int) -> int:
         method.select(warm)  # compiled before anything is timed
     for uri in sources:
         seeds = SeedGrid.from_frame(nth_frame(uri, frame))
-        seconds = []
-        for method in methods:
-            start = time.perf_counter()
-            method.select(seeds)
-            seconds.append(time.perf_counter() - start)
+        seconds = [timeit(partial(method.select, seeds), number=1) for method in methods]
         papers = PAPERS_SECONDS.get(short_name(uri), ())
         rows.append((short_name(uri), *(f"{s:.3g}" for s in (*seconds, *papers))))
     heads = ("", "NG exact", "NG fast", "ImpMap", "paper: NG", "ImpMap")
