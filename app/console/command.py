@@ -65,6 +65,7 @@ test (count $typed) -gt 1; and not string match -q -- "-*" $typed[-1] (commandli
 """
 """Files are what a command takes but for its options: fish is told none by the parser."""
 Run = Callable[..., int | None]
+Call = functools.partial[int | None]
 Example = tuple[str, str]
 
 
@@ -175,7 +176,7 @@ def find(name: str) -> Command:
     raise UsageError(f"there is no command '{name}'. {hint} '{PROGRAM} --help' shows examples.")
 
 
-def parse(chosen: Command, arguments: Sequence[str]) -> Callable[[], int | None]:
+def parse(chosen: Command, arguments: Sequence[str]) -> Call:
     """Return a command's call with what was typed after its name, without running it.
 
     Raises
@@ -194,7 +195,7 @@ def parse(chosen: Command, arguments: Sequence[str]) -> Callable[[], int | None]
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            call: Callable[[], int | None] = tyro.cli(
+            call: Call = tyro.cli(
                 bound,
                 prog=f"{PROGRAM} {chosen.name}",
                 description=chosen.description,
@@ -208,9 +209,7 @@ def parse(chosen: Command, arguments: Sequence[str]) -> Callable[[], int | None]
     return call
 
 
-def parse_with_settings(
-    chosen: Command, arguments: Sequence[str], file: Path | None, preset: str | None
-) -> Callable[[], int | None]:
+def parse_with_settings(chosen: Command, arguments: Sequence[str], file: Path | None, preset: str | None) -> Call:
     """As `parse`, with the options of a settings file, else of a preset, where none are typed.
 
     Raises
@@ -231,7 +230,7 @@ def parse_with_settings(
         raise UsageError(f"{error} That option stands in '{file}'.") from None
 
 
-def with_source_options(call: Callable[[], int | None], given: dict[str, str]) -> Callable[[], Any]:
+def with_source_options(call: Call, given: dict[str, str]) -> Call:
     """A parsed call whose sources, or sensor, have these options after their names.
 
     Raises
@@ -241,8 +240,7 @@ def with_source_options(call: Callable[[], int | None], given: dict[str, str]) -
     """
     if not given:
         return call
-    run = call.func  # type: ignore[attr-defined]  # a partial, as `parse` makes it
-    bound = inspect.signature(run).bind(*call.args, **call.keywords)  # type: ignore[attr-defined]
+    bound = inspect.signature(call.func).bind(*call.args, **call.keywords)
     bound.apply_defaults()
     names = [name for name in SOURCES if bound.arguments.get(name) is not None]
     if not names:
@@ -256,7 +254,7 @@ def with_source_options(call: Callable[[], int | None], given: dict[str, str]) -
         else:
             end = len(value) - (name == "paths")
             bound.arguments[name] = (*(appended(each, given) for each in value[:end]), *value[end:])
-    return functools.partial(run, *bound.args, **bound.kwargs)
+    return functools.partial(call.func, *bound.args, **bound.kwargs)
 
 
 def _one_line(boxed: str, name: str) -> str:
