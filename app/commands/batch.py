@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from rich.console import Console
-from rich.markup import escape
 
 from selective_depth.app.archive import SUMMARY_FILE, Batch, Job, Stream, dashboard, engine
 from selective_depth.app.commands.model import save_depth, save_result
@@ -166,19 +164,19 @@ def _note(batch: Batch, stream: Stream, began_s: float) -> tuple[int, str]:
 
 def _print(summary: pa.Table, batch: Batch, seconds: float, out: Path) -> None:
     """The summary on the terminal: recordings as far as there is room for them, all failures, the whole."""
-    console, rows = Console(highlight=False), []
+    rows = []
     for row in summary.slice(0, MOST_ROWS).to_pylist():
         figures = ["" if row[name] is None else f"{row[name]:,.{0 if name in SHOWN[:2] else 1}f}" for name in SHOWN]
-        rows.append((escape(row["recording"]), *figures, "" if row["state"] == "whole" else row["state"]))
+        rows.append((row["recording"], *figures, "" if row["state"] == "whole" else row["state"]))
     print_table(rows, ("recording", *SHOWN, ""), justify="l" + "r" * len(SHOWN) + "l")
     if len(summary) > MOST_ROWS:
-        console.print(f"and {len(summary) - MOST_ROWS:,} more")
-    console.print()
+        say(f"and {len(summary) - MOST_ROWS:,} more")
+    say("")
     for row in summary.filter(pc.is_valid(summary["failure"])).to_pylist():
-        console.print(f"{row['recording']}: {row['failure']}", soft_wrap=True, markup=False)
+        say(f"{row['recording']}: {row['failure']}")
     before = f", {batch.skipped:,} of them done before" if batch.skipped else ""
     done = f"{batch.done:,} recording{'s' * (batch.done != 1)} ({batch.failures:,} not whole{before})"
     there = pc.sum(summary["frames"]).as_py() or 0
     pace = f"{batch.frames:,} frames in {seconds:.1f} s, {batch.frames / max(seconds, 1e-9):.1f} frames/s"
-    console.print(f"{done}, {there:,} frames; {pace}", soft_wrap=True)
+    say(f"{done}, {there:,} frames; {pace}")
     say(f"wrote {out / SUMMARY_FILE}")

@@ -6,9 +6,6 @@ from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
 
-from rich.console import Console
-from rich.markup import escape
-
 from selective_depth.app.archive import Recording, recordings
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.errors import UsageError
@@ -65,7 +62,7 @@ def _several(doing: str, found: Sequence[Recording], do: Callable[[Recording], t
             except SourceError as error:
                 frames, trouble = 0, str(error)
             wrong += bool(trouble)
-            rows.append((escape(each.name), f"{frames:,}", escape(trouble or "whole")))
+            rows.append((each.name, f"{frames:,}", trouble or "whole"))
             progress.update(at, f"of the recording{'s' * (len(found) > 1)}")
     print_table(rows, ("recording", "frames", ""), justify="lrl")
     say(f"{len(found):,} recording{'s' * (len(found) != 1)}, {wrong:,} not whole")
@@ -194,8 +191,7 @@ def _writer(out: Path, fps: float) -> FrameWriter:
 
 
 def _print_check(report: OniReport) -> None:
-    console = Console(highlight=False)
-    console.print(str(report.path), soft_wrap=True)
+    say(str(report.path))
     rows = [("size", f"{report.size_bytes:,}", "bytes")]
     if report.tail_bytes:
         rows.append(("unused at its end", f"{report.tail_bytes:,}", "bytes"))
@@ -213,10 +209,10 @@ def _print_check(report: OniReport) -> None:
     rows.append(("readable depth frames", f"{report.readable_frames:,}", "frames"))
     print_table(rows, justify="lrl")
     for problem in report.problems[:MOST_PROBLEMS]:
-        console.print(str(problem), soft_wrap=True, markup=False)
+        say(str(problem))
     if len(report.problems) > MOST_PROBLEMS:
-        console.print(f"and {len(report.problems) - MOST_PROBLEMS} more problems")
-    console.print(_verdict(report), soft_wrap=True, markup=False)
+        say(f"and {len(report.problems) - MOST_PROBLEMS} more problems")
+    say(_verdict(report))
 
 
 def _verdict(report: OniReport) -> str:

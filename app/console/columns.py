@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 
 def print_table(
@@ -17,7 +18,7 @@ def print_table(
     Parameters
     ----------
     rows : iterable of sequence of str
-        The cells, a first one of each row its name.
+        The cells, a first one of each row its name; shown as they are, whatever brackets are in them.
     heads : sequence of str, optional
         What stands above the columns.
     justify : str, default "lr"
@@ -36,5 +37,5 @@ def print_table(
         whole = at == 0 and bool(heads) and justify != "l"  # the name of a row of figures
         table.add_column(heads[at] if heads else "", justify=side, no_wrap=whole, overflow="fold")
     for row in rows:
-        table.add_row(*row, style="bold" if bold and row[0] == bold else "")
+        table.add_row(*map(Text, row), style="bold" if bold and row[0] == bold else "")
     Console(highlight=False).print(table)

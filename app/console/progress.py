@@ -23,8 +23,7 @@ REPEAT_S = 10.0
 @contextmanager
 def waiting(why: str) -> Iterator[None]:
     """Say why, if what happens inside takes longer than `PATIENCE_S`."""
-    console = Console(stderr=True, highlight=False)
-    timer = threading.Timer(PATIENCE_S, lambda: console.print(f"{why} …"))
+    timer = threading.Timer(PATIENCE_S, lambda: sys.stderr.write(f"{why} …\n"))
     timer.daemon = True
     timer.start()
     try:
@@ -52,7 +51,7 @@ class FrameProgress:
         self._drawn = sys.stderr.isatty()
         self._bar = progress.Progress(
             progress.SpinnerColumn(),
-            progress.TextColumn("{task.description}"),
+            progress.TextColumn("{task.description}", markup=False),
             *((progress.BarColumn(),) if total else ()),
             progress.MofNCompleteColumn(),
             progress.TextColumn("frames"),
