@@ -159,7 +159,7 @@ class Batch:
             interrupt.check()
             progress(stream)
         self._flush()
-        summary = pa.concat_tables([schema_of(SUMMARY).empty_table(), *self._tables]).sort_by("recording")
+        summary = pa.concat_tables(self._tables).sort_by("recording")
         write_table(out / SUMMARY_FILE, summary, SCHEMA)
         if not self._unfinished:  # whose ranges are kept for the next run
             shutil.rmtree(out / WORK, ignore_errors=True)
