@@ -328,8 +328,7 @@ def model(
     """
     from selective_depth.app.commands.model import model_frame
 
-    settings = Settings(**vars(selectors), acquire=acquire)
-    return model_frame(source, out, frame, settings)
+    return model_frame(source, out, frame, Settings(**vars(selectors), acquire=acquire))
 
 
 @command("Pictures")
@@ -411,8 +410,7 @@ def snapshot(
     """
     from selective_depth.app.commands.snapshot import draw_snapshot
 
-    settings = Settings(**vars(selectors), acquire=acquire)
-    return draw_snapshot(sources, frame, out, settings, page)
+    return draw_snapshot(sources, frame, out, Settings(**vars(selectors), acquire=acquire), page)
 
 
 # Declared here, to be listed after those above.

@@ -76,8 +76,7 @@ def figure(
     """
     from selective_depth.app.commands.figures import draw_figure
 
-    settings = Settings(**vars(selectors))
-    return draw_figure(number, sources or SCENES, out, frame, settings, page, save)
+    return draw_figure(number, sources or SCENES, out, frame, Settings(**vars(selectors)), page, save)
 
 
 @command("Pictures")
