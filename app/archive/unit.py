@@ -5,7 +5,6 @@ Whichever worker does it, and however often, the result is the same except for t
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import os
@@ -13,7 +12,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -85,7 +84,7 @@ class Job:
     @property
     def stated(self) -> dict[str, Any]:
         """The settings that results depend on."""
-        stated = dataclasses.asdict(self.settings)
+        stated = asdict(self.settings)
         del stated["viewer"], stated["play"], stated["run"]["threads"], stated["run"]["no_governor"]
         file = self.settings.acquire.by.rpartition(":")[0]
         own = hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""

@@ -9,8 +9,7 @@ from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.exit_codes import FAILED, INTERRUPTED, OK
 from selective_depth.app.console.progress import FrameProgress, waiting
 from selective_depth.app.pipeline import say
-from selective_depth.drivers.openni import find_runtime, survey, usb_advice
-from selective_depth.drivers.openni import record as record_oni
+from selective_depth.drivers.openni import find_runtime, record, survey, usb_advice
 
 UNKNOWN_ADVICE = (
     "Is it plugged in and powered? A Kinect for Xbox 360 needs libfreenect's OpenNI2 driver beside"
@@ -55,9 +54,7 @@ def record_sensor(out: Path, device: str, *, frames: int | None, seconds: float 
     interrupt.check()
     interrupt.allow(interrupt.SAVE_S)
     with FrameProgress(f"Recording {out}", frames) as progress:
-        report = record_oni(
-            out, device, frames=frames, duration_s=seconds, progress=progress.update, overwrite=overwrite
-        )
+        report = record(out, device, frames=frames, duration_s=seconds, progress=progress.update, overwrite=overwrite)
     say(f"wrote {out}: {report.frames} frames, read back; it took {report.seconds:.1f} s")
     if report.problem:
         say(f"note: {report.problem}")

@@ -15,8 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from selective_depth.app.archive import FigureTable, writing
-from selective_depth.app.archive import row_of as figure_row
+from selective_depth.app.archive import FigureTable, row_of, writing
 from selective_depth.app.commands.model import save_result
 from selective_depth.app.commands.steering import Recording, Status, Steering, changed, unused
 from selective_depth.app.console import interrupt
@@ -408,7 +407,7 @@ class Session:
         self.last = told
         self._viewer.show(told)
         if self._table is not None:
-            self._table.add(figure_row(told))
+            self._table.add(row_of(told))
         self._publish(
             state=told.state, gain=told.gain, given_up=told.given_up, fps=told.figures["fps"],
             skipped=self._source.dropped - self.report.dropped_starting - self._went_by,
