@@ -52,7 +52,7 @@ def record_sensor(out: Path, device: str, *, frames: int | None, seconds: float 
         Exit code: 0, 1 if frames are missing, 130 after Ctrl-C.
     """
     interrupt.check()
-    interrupt.allow(interrupt.SAVE_S)
+    interrupt.patience_s = interrupt.SAVE_S
     with FrameProgress(f"Recording {out}", frames) as progress:
         report = record(out, device, frames=frames, duration_s=seconds, progress=progress.update, overwrite=overwrite)
     say(f"wrote {out}: {report.frames} frames, read back; it took {report.seconds:.1f} s")

@@ -29,9 +29,10 @@ SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if 
 
 before_leaving: Callable[[], None] | None = None
 """What has to be put in order even where the program is ended at once: a terminal's mode."""
+patience_s = LEAVE_S
+"""How long what is going on may take to end."""
 
 _asked = threading.Event()
-_patience_s = LEAVE_S
 _deferring = False
 
 
@@ -52,12 +53,6 @@ def install() -> None:
     # The program ends without its destructors. What processes shared is then cleared away by
     # Python's tracker of such things, which need not warn of it.
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
-
-
-def allow(seconds: float) -> None:
-    """Set how long what is going on may take to end."""
-    global _patience_s
-    _patience_s = seconds
 
 
 def check() -> None:
@@ -116,7 +111,7 @@ def _watch(receive: Callable[[int], bytes]) -> None:
     """
     while receive(1)[0] not in SIGNALS:
         pass
-    time.sleep(_patience_s)
+    time.sleep(patience_s)
     if before_leaving is not None:
         before_leaving()
     os._exit(INTERRUPTED)
