@@ -13,7 +13,6 @@ from selective_depth.app.console.progress import waiting
 from selective_depth.app.pictures import Row, alone, contact_rows, sheet, write_picture
 from selective_depth.app.pipeline import FrameResult, Pipeline, open_and_tell, say
 from selective_depth.app.settings import PanelOptions, Settings
-from selective_depth.drivers.errors import SourceEndedError
 from selective_depth.drivers.frame import DepthFrame
 
 
@@ -31,15 +30,12 @@ def nth_frame(uri: str, number: int) -> DepthFrame:
     UsageError
         If the source has fewer frames.
     """
+    count = 0
     with open_and_tell(uri) as source:
-        for reached in range(number + 1):
-            try:
-                frame = source.read()
-            except SourceEndedError:
-                raise UsageError(
-                    f"--frame is {number}, but '{uri}' has {reached} frames; the last is --frame {reached - 1}."
-                ) from None
-    return frame
+        for count, frame in enumerate(source, start=1):
+            if count > number:
+                return frame
+    raise UsageError(f"--frame is {number}, but '{uri}' has {count} frames; the last is --frame {count - 1}.")
 
 
 def still_of(frame: DepthFrame, settings: Settings) -> FrameResult:
