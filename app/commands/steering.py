@@ -107,10 +107,9 @@ class Steering:
         UsageError
             If there is no such thing to change, or it cannot have that value.
         """
-        allowed = _ALLOWED.get(name)
         try:
-            good = allowed is not None and allowed(value)
-        except (TypeError, ValueError):
+            good = _ALLOWED[name](value)
+        except (KeyError, TypeError, ValueError):
             good = False
         if not good:
             raise UsageError(f"a run cannot be asked for {name!r:.40} {value!r:.40}.")
