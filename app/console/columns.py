@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from rich.console import Console
@@ -11,13 +11,13 @@ from rich.text import Text
 
 
 def print_table(
-    rows: Iterable[Sequence[str]], heads: Sequence[str] = (), justify: str = "lr", bold: str = "", **options: Any
+    rows: Sequence[Sequence[str]], heads: Sequence[str] = (), justify: str = "lr", bold: str = "", **options: Any
 ) -> None:
     """Print rows of cells on standard output; without colours if that is no terminal.
 
     Parameters
     ----------
-    rows : iterable of sequence of str
+    rows : sequence of sequence of str
         The cells, a first one of each row its name; shown as they are, whatever brackets are in them.
     heads : sequence of str, optional
         What stands above the columns.
@@ -28,7 +28,6 @@ def print_table(
     **options
         Of `rich.table.Table`: a title, a caption.
     """
-    rows = list(rows)
     table = Table(
         box=None, pad_edge=False, show_header=bool(heads), title_justify="left", caption_justify="left", **options
     )
