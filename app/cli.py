@@ -44,17 +44,15 @@ EXAMPLES = (
     (f"{PROGRAM} devices", "what is plugged in, or what is missing"),
 )
 
-Options = Annotated[Settings, arg(name="")]
 LiveOptions = Annotated[LiveSettings, arg(name="")]
 Acquiring = Annotated[AcquireOptions, arg(name="")]
-Page = Annotated[PanelOptions, arg(name="")]
 Selectors = Annotated[SelectorOptions, arg(name="")]
 DEFAULTS, LIVE, SELECTORS, PAGE, BATCH = Settings(), LiveSettings(), SelectorOptions(), PanelOptions(), BatchOptions()
 MODEL, SHOWN, DEMO = AcquireOptions(budget=0.05, rounds=8), AcquireOptions(budget=0.05, rounds=4), DemoOptions()
 
 
 @command("Watch")
-def replay(source: SourceOrSample = None, /, settings: Options = DEFAULTS) -> int:
+def replay(source: SourceOrSample = None, /, settings: Annotated[Settings, arg(name="")] = DEFAULTS) -> int:
     """Replay a recording through both selectors.
 
     Parameters
@@ -380,7 +378,7 @@ def snapshot(
     frame: Natural = 0,
     selectors: Selectors = SELECTORS,
     acquire: Acquiring = DEFAULTS.acquire,
-    page: Page = PAGE,
+    page: Annotated[PanelOptions, arg(name="")] = PAGE,
 ) -> int:
     """Write a contact sheet of one frame of each source, and every panel alone.
 

@@ -23,10 +23,6 @@ from selective_depth.app.settings import (
     optional,
 )
 
-Page = Annotated[PictureOptions, arg(name="")]
-Panels = Annotated[PanelOptions, arg(name="")]
-Files = Annotated[EvaluationFiles, arg(name="")]
-Compared = Annotated[ComparisonOptions, arg(name="")]
 Selectors = Annotated[SelectorOptions, arg(name="")]
 PAGE, PANELS, SELECTORS = PictureOptions(), PanelOptions(), SelectorOptions()
 FILES, COMPARED = EvaluationFiles(), ComparisonOptions()
@@ -42,7 +38,7 @@ def figure(
     save: Annotated[Path | None, optional("FILE.rrd")] = None,
     frame: Natural = 0,
     selectors: Selectors = SELECTORS,
-    page: Panels = PANELS,
+    page: Annotated[PanelOptions, arg(name="")] = PANELS,
 ) -> int:
     """Make a figure of the paper, on the virtual scenes or on any source.
 
@@ -174,10 +170,10 @@ def bench(
 def evaluate(
     sources: Annotated[tuple[str, ...], optional("SOURCE...")],
     /,
-    comparison: Compared = COMPARED,
+    comparison: Annotated[ComparisonOptions, arg(name="")] = COMPARED,
     selectors: Selectors = SELECTORS,
-    files: Files = FILES,
-    page: Page = PAGE,
+    files: Annotated[EvaluationFiles, arg(name="")] = FILES,
+    page: Annotated[PictureOptions, arg(name="")] = PAGE,
 ) -> None:
     """Compare ways of choosing measurements: how good a model does a budget buy?
 

@@ -105,7 +105,6 @@ Layout = Literal["engineer", "visitor"]
 Layer = Literal["colour", "cloud", "nodes", "triangles", "samples"]
 LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 LAYERS: tuple[Layer, ...] = get_args(Layer)
-Hide = Annotated[tuple[Layer, ...], arg(metavar=f"{'|'.join(LAYERS)}...")]
 
 
 @dataclass(frozen=True)
@@ -242,7 +241,7 @@ class ViewerOptions:
     """Depth at its bright end. Both hold for the whole run, so that colours never jump."""
     layout: Layout = "engineer"
     """visitor: large pictures and what selecting gains; engineer: every figure of the run too."""
-    hide: Hide = ()
+    hide: Annotated[tuple[Layer, ...], arg(metavar=f"{'|'.join(LAYERS)}...")] = ()
     """Layers that are not shown."""
     detail: Flag = False
     """Show the kriging estimate, its variance and the long-edge triangles too."""
@@ -307,16 +306,13 @@ class ComparisonOptions:
     """A Dask scheduler, whose workers do the work instead: its address or its file."""
 
 
-Keep = Annotated[tuple[Literal["masks", "maps", "depth"], ...], arg(metavar="masks|maps|depth...")]
-
-
 @dataclass(frozen=True)
 class BatchOptions:
     """What is kept of each recording besides its table, and who does the work."""
 
     models: Flag = False
     """The model of its last frame: cloud.ply, depth.png and samples.npz."""
-    keep: Keep = ()
+    keep: Annotated[tuple[Literal["masks", "maps", "depth"], ...], arg(metavar="masks|maps|depth...")] = ()
     """Of every frame, as PNG: masks (1 neural gas + 2 improvement), maps (the improvement map,
     65535 = the best), depth (the model in mm)."""
     stills: Natural = 0
