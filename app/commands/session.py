@@ -99,6 +99,7 @@ class Session:
         self._governor: Governor
         self._table: FigureTable | None = None
         self._recording: Recording | None = None
+        self._recorded: list[Recording] = []
         self._unfinished: list[threading.Thread] = []
         self._source: DepthSource
         self._pipeline: Pipeline
@@ -310,12 +311,11 @@ class Session:
         """
         if on and self._recording is None:
             seen = self.settings.viewer
-            named = seen.record if seen.record not in self.report.recorded else None
-            path = named or unused("record", ".oni")
+            path = seen.record if seen.record and not self._recorded else unused("record", ".oni")
             self._recording = Recording(self._source, path, seen.overwrite)
             if first is not None and not self._source.live:
                 self._recording.write(first)
-            self.report.recorded[path] = (0, 0.0)
+            self._recorded.append(self._recording)
             self._tell(f"Recording to {path}.")
         elif not on:
             self._stop_recording(self._tell)
@@ -323,19 +323,15 @@ class Session:
     def _stop_recording(self, tell: Callable[[str], None]) -> None:
         recording, self._recording = self._recording, None
         if recording is not None:
-
-            def done(sentence: str) -> None:
-                self.report.recorded[recording.path] = recording.frames, recording.seconds
-                tell(sentence)
-
-            self._unfinished.append(recording.stop_beside(done))
+            self._unfinished.append(recording.stop_beside(tell))
 
     def _finish_recordings(self) -> None:
         """Finish what is recorded to the last frame, however long that takes."""
         self._stop_recording(self.report.troubles.append)
         for thread in self._unfinished:
             thread.join()
-        self.report.written += [path for path, (frames, _) in self.report.recorded.items() if frames]
+        self.report.recorded = {each.path: (each.frames, each.seconds) for each in self._recorded}
+        self.report.written += [each.path for each in self._recorded if each.frames]
 
     def _take_picture(self) -> None:
         """A sheet of the last frame, drawn beside the run."""
