@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -66,7 +65,14 @@ class Keeping:
         wanted = {at * count // self.stills for at in range(self.stills)}
         recording = folder / "recording.rrd"
         part = recording.with_name(".recording.part.rrd")
-        viewer = self._viewer(part, frames) if self.rrd else None
+        viewer = None
+        if self.rrd:
+            from selective_depth.app.viewer import Viewer
+
+            make_folder(folder)
+            part.unlink(missing_ok=True)
+            seen = ViewerOptions(headless=True, save=part)
+            viewer = Viewer(seen, live=False, times=StageTimes(), frames=frames, title="batch")
         last: FrameResult | None = None
 
         def keep(result: FrameResult) -> None:
@@ -91,14 +97,6 @@ class Keeping:
             part.replace(recording)
         if last is not None and self.models:
             save_result(folder / "model", last)
-
-    def _viewer(self, part: Path, frames: int) -> Any:
-        from selective_depth.app.viewer import Viewer
-
-        make_folder(part.parent)
-        part.unlink(missing_ok=True)
-        options = ViewerOptions(headless=True, save=part)
-        return Viewer(options, live=False, times=StageTimes(), frames=frames, title="batch")
 
 
 def _save(path: Path, kind: str, result: FrameResult) -> None:
