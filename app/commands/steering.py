@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import queue
 import threading
 import time
@@ -70,7 +69,7 @@ class Status:
     recording: bool = False
     ended: bool = False
     frames: int = 0
-    fps: float = math.nan
+    fps: float = 0.0
     skipped: int = 0
     state: str = "starting"
     gain: str = ""
