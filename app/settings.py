@@ -220,7 +220,7 @@ class ViewerOptions:
     json: Annotated[Path | None, optional("FILE.json")] = None
     """Write the report at the end as JSON too."""
     table: Annotated[Path | None, optional("FILE.parquet")] = None
-    """Write a row of figures for each frame, as .parquet or .csv."""
+    """Write a row of figures for each frame, as .parquet."""
     save_model: Annotated[Path | None, optional("DIR")] = None
     """At the end, write the last model: cloud.ply, depth.png and samples.npz."""
     serve: Flag = False

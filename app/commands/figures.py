@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.app.commands.snapshot import draw_snapshot, is_folder, nth_frame, short_name, write_all
+from selective_depth.app.commands.snapshot import draw_snapshot, is_folder, nth_frame, short_name, stems_of, write_all
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.exit_codes import OK
@@ -200,6 +200,8 @@ def draw_figure(
     path = out or Path(f"figure-{number}.png")
     is_folder(path)  # refused before the work is done
     check_output(save)
+    if save is not None and number != 1:
+        raise UsageError(f"--save is for the trainings of figure 1; figure {number} has none. Leave it out.")
     if number == 5:
         return draw_snapshot(sources, frame, path, settings, page)
     gas, trained, stems = settings.gas, [], []
@@ -213,13 +215,13 @@ def draw_figure(
         with waiting(f"training {len(DENSITIES)} times"):
             rows = densities_figure(frames[0], DENSITIES, gas.epochs, gas.seed)
     else:
-        stems = [f"{short_name(uri)}-" for uri in sources]
+        stems = stems_of(sources)
         rows = [
             (f"{stem[:-1]}, frame {frame}", (panels.shaded_panel(shown), panels.depth_panel(shown)))
             for stem, shown in zip(stems, frames, strict=True)
         ]
     write_all(path, f"figure-{number}", rows, stems or [""] * len(rows), page, legend=False)
-    if save is not None and trained:
+    if save is not None:
         from selective_depth.app.viewer import save_trainings
 
         save_trainings(save, frames[0], ((length, chosen["3d"]) for length, chosen in trained))

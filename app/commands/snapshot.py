@@ -133,13 +133,19 @@ def snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings,
     if not sources:
         raise UsageError("no source was named; give recordings, folders or scenes.")
     is_folder(out)  # refused before the work is done
-    names = [short_name(uri) for uri in sources]
-    stems, rows = [], []
-    for at, (uri, name) in enumerate(zip(sources, names, strict=True)):
-        again = names[:at].count(name)
-        stems.append(f"{name}-{again + 1}-" if again else f"{name}-")
-        rows.append((f"{stems[-1][:-1]}, frame {number}", still_of(nth_frame(uri, number), settings)))
+    stems = stems_of(sources)
+    rows = [
+        (f"{stem[:-1]}, frame {number}", still_of(nth_frame(uri, number), settings))
+        for uri, stem in zip(sources, stems, strict=True)
+    ]
     return write_all(out, "sheet", contact_rows(rows), stems, page)
+
+
+def stems_of(sources: Sequence[str]) -> list[str]:
+    """What the panels of each source are called before their own names; no two alike."""
+    names = [short_name(uri) for uri in sources]
+    again = [names[:at].count(name) for at, name in enumerate(names)]
+    return [f"{name}-{count + 1}-" if count else f"{name}-" for name, count in zip(names, again, strict=True)]
 
 
 def draw_snapshot(sources: Sequence[str], number: int, out: Path, settings: Settings, page: PanelOptions) -> int:

@@ -165,7 +165,7 @@ def say(sentence: str) -> None:
 
 def print_report(report: RunReport) -> None:
     """Print the table of a run on standard output; without colours if that is no terminal."""
-    console, means = Console(highlight=False), report.means
+    console, means = Console(highlight=False, markup=False), report.means
     console.print(report.source, soft_wrap=True)  # a table would break a long path
 
     def mean(name: str, digits: int = 1) -> str:

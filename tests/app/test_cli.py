@@ -69,7 +69,8 @@ def start(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
 
 
 def depth_rows(path: Path) -> int:
-    return sum(chunk.num_rows for chunk in RrdReader(str(path)).stream() if chunk.entity_path == "/camera/depth")
+    chunks = [chunk for chunk in RrdReader(str(path)).stream() if chunk.entity_path == "/camera/depth"]
+    return sum(chunk.num_rows for chunk in chunks if not chunk.is_static)
 
 
 # Help
@@ -602,6 +603,16 @@ def test_real_sequence_is_saved_whole(shared_data: Path, tmp_path: Path) -> None
     for frame, picture in enumerate(pictures):
         depth_mm = cv2.imread(str(picture), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(found[frame].reshape(depth_mm.shape), depth_mm)
+
+
+def test_brackets_in_names_are_told_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "a[red]b"
+    folder.mkdir()
+    assert cli.run(["export", "virtual:ball?size=160x120", str(folder / "frames"), "--frames", "2"]) == 0
+    table = tmp_path / "[bold].parquet"
+    assert cli.run(["replay", str(folder / "frames"), *QUICK, "--table", str(table)]) == 0
+    told = capsys.readouterr().out
+    assert str(folder) in told and f"wrote {table}" in told
 
 
 def interrupt(out: Path, arguments: list[str], after_s: float | None, number: int = signal.SIGINT) -> tuple[str, str]:

@@ -15,6 +15,7 @@ from selective_depth.app import cli
 from selective_depth.app.commands import figures
 from selective_depth.app.pictures import palette, sheet, write_picture
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.oni import write_oni
 from selective_depth.selectors.seeds import SeedGrid
 
 OBJECT = "virtual:ball?size=160x120&noise=off&frames=3"
@@ -122,6 +123,17 @@ def test_a_figure_into_a_folder_has_every_panel_beside_it(small, tmp_path: Path)
     assert names == {"figure-1.svg", "shaded.svg", *trained}
 
 
+def test_sources_of_one_name_have_panels_of_their_own(tmp_path: Path):
+    frames = [DepthFrame(np.full((48, 64), 900 + 100 * k, np.uint16), 0, 0, Camera.kinect(64, 48)) for k in range(2)]
+    for name, frame in zip("ab", frames, strict=True):
+        (tmp_path / name).mkdir()
+        write_oni(tmp_path / name / "w.oni", [frame])
+    words = ["figure", "4", *(str(tmp_path / name / "w.oni") for name in "ab"), "--out", str(tmp_path / "new")]
+    assert cli.run([*words, "--dpi", "40"]) == 0
+    names = {path.name for path in (tmp_path / "new").iterdir()}
+    assert len(names) == 5 and {name.partition("-")[2][:2] for name in names if name.startswith("w-2-")} == {"2-"}
+
+
 def test_the_table_of_the_paper_shows_our_times_beside_the_papers(capsys):
     assert cli.run(["table", "1", "virtual:ball?size=320x240&noise=off"]) == 0
     row = next(line for line in capsys.readouterr().out.splitlines() if "ball" in line).split()
@@ -156,6 +168,7 @@ def test_table_is_written(small, tmp_path: Path, capsys):
         (["figure", "1", OBJECT, "--out", "x.gif"], "must end in .png, .webp, .pdf or .svg"),
         (["figure", "1", OBJECT, "--out", "no/such/x.png"], "its folder does not exist"),
         (["figure", "1", OBJECT, "--frame", "9"], "the last is"),
+        (["figure", "4", "--save", "x.rrd"], "figure 4 has none"),
         (["nodes", OBJECT, "--every", "0"], "--every is 0; it must be 1 or more"),
         (["nodes", OBJECT, "--out", "no/such/x.md"], "its folder does not exist"),
         (["nodes", "virtual:ball?live=1", "--every", "2"], "never ends"),
