@@ -175,16 +175,13 @@ def backdrop_limits_mm(limits_mm: tuple[float, float]) -> tuple[float, float]:
 @cache
 def palette(colormap: Colourmap) -> npt.NDArray[np.uint32]:
     """The 256 colours of a colour map, packed as 0xRRGGBBAA."""
-    levels = np.arange(256, dtype=np.uint8).reshape(-1, 1)
+    levels = np.arange(256, dtype=np.uint8)
     if colormap == "ice":
         at = np.linspace(0, 255, len(_ICE))
-        made: npt.NDArray[np.generic] = np.stack(
-            [np.interp(levels[:, 0], at, part).round() for part in zip(*_ICE, strict=True)][::-1], axis=1
-        )
-    else:
-        made = np.asarray(cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{colormap.upper()}")))[:, 0]
-    packed = made.astype(np.uint32) @ np.array([1 << 8, 1 << 16, 1 << 24], dtype=np.uint32) + np.uint32(255)
-    return np.asarray(packed, dtype=np.uint32)
+        parts = [np.interp(levels, at, part).round() for part in zip(*_ICE, strict=True)]
+        return packed(np.stack(parts, axis=1).astype(np.uint8))
+    made = np.asarray(cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{colormap.upper()}")), np.uint8)
+    return packed(made[0, :, ::-1])
 
 
 @cache
