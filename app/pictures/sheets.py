@@ -130,9 +130,7 @@ def write_picture(path: Path, figure: Figure, dpi: int = DPI) -> None:
 
     kind = path.suffix.lower().removeprefix(".")
     drawn = io.BytesIO()
-    more: dict[str, Any] = {}
-    if kind == "webp":
-        more = {"pil_kwargs": {"quality": _WEBP_QUALITY}}
+    more: dict[str, Any] = {"pil_kwargs": {"quality": _WEBP_QUALITY}} if kind == "webp" else {}
     if kind in ("pdf", "svg"):
         for image in figure.findobj(AxesImage):
             image.set_interpolation("none")
