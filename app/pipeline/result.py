@@ -109,11 +109,6 @@ class FrameResult:
         What the governor leaves out, in a few words; empty if it is nothing.
     look : ViewerOptions or None
         How it is to be shown, where that changes on the way.
-
-    Attributes
-    ----------
-    samples : int
-        Measurements that returned depth, seeds included.
     """
 
     frame: DepthFrame
@@ -130,13 +125,6 @@ class FrameResult:
     given_up: str = ""
     look: ViewerOptions | None = None
 
-    @property
-    def samples(self) -> int:
-        """Measurements that returned depth, seeds included."""
-        if self.acquisition is None:
-            return int(self.seeds.valid.sum())
-        return int(self.acquisition.returned.sum())
-
 
 def figures_of(result: FrameResult) -> dict[str, float]:
     """What a frame came to, but for its times; NaN for what was not made of it.
@@ -145,12 +133,13 @@ def figures_of(result: FrameResult) -> dict[str, float]:
     tables of `archive` have the same names, and are described there.
     """
     acquisition, model, size = result.acquisition, result.model, result.frame.depth_mm.size
+    returned = result.seeds.valid if acquisition is None else acquisition.returned
     nan, even = math.nan, None if model is None else model.even
     to_truth = result.memory is not None and result.frame.truth_mm is not None  # as the line takes the model's
     seeds = 0 if result.memory is not None else result.seeds.valid.size  # a memory's first frame begins it
     measured = result.seeds.valid.size if acquisition is None else len(acquisition.uv)
     return {
-        "samples": result.samples,
+        "samples": int(np.count_nonzero(returned)),
         "shots": 0 if acquisition is None else measured - seeds,
         "depth_percent": 100 * int(np.count_nonzero(result.frame.depth_mm)) / size,
         "measured_percent": nan if acquisition is None else 100 * measured / size,
