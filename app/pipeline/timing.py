@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections import defaultdict
@@ -37,14 +36,12 @@ class _Durations:
     ring: npt.NDArray[np.float32] = field(default_factory=lambda: np.full(KEPT, np.nan, np.float32))
     count: int = 0
     highest: float = 0.0
-    last: float = math.nan
 
     def add(self, duration_ms: float) -> None:
         """Add one."""
         self.ring[self.count % KEPT] = duration_ms
         self.count += 1
         self.highest = max(self.highest, duration_ms)
-        self.last = duration_ms
 
     def summary(self) -> StageSummary:
         """Median and 99th percentile of those kept, maximum of all."""
@@ -87,9 +84,9 @@ class StageTimes:
             self._stages[name].add(duration_ms)
 
     def last_ms(self) -> dict[str, float]:
-        """Latest duration of each of the `STAGES`; NaN of one that has not run."""
+        """Latest duration of every stage that has run."""
         with self._lock:
-            return {name: self._stages[name].last if name in self._stages else math.nan for name in STAGES}
+            return {name: float(each.ring[(each.count - 1) % KEPT]) for name, each in self._stages.items()}
 
     def summary(self) -> dict[str, StageSummary]:
         """Median, 99th percentile and maximum of every stage, in their order."""
