@@ -332,9 +332,8 @@ class Pipeline:
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        self._remembering.shutdown(cancel_futures=True)
-        self._beside.shutdown(cancel_futures=True)
-        self._evening.shutdown(cancel_futures=True)
+        for executor in (self._remembering, self._beside, self._evening):
+            executor.shutdown(cancel_futures=True)
 
 
 def switched(options: AcquireOptions) -> Iterator[AcquireOptions]:
