@@ -11,7 +11,7 @@ from selective_depth.app.benchmark.bench import BenchReport, bench, ratios
 from selective_depth.app.benchmark.loads import Spread
 from selective_depth.app.console.columns import print_table
 from selective_depth.app.console.output import check_output, write_output
-from selective_depth.app.pipeline import say
+from selective_depth.app.pipeline import say, write_if_asked
 
 PAGE = "page.md"
 """The page's text beside this module, with places for the figures."""
@@ -28,10 +28,8 @@ def run_bench(source: str, frames: int | None, *, json: Path | None, page: Path 
     check_output(json, page)
     report = bench(source, frames, peers=peers, say=lambda text: say(f"timing: {text} …"))
     print_bench(report)
-    for path, text in ((json, report.to_json), (page, lambda: to_page(report))):
-        if path is not None:
-            write_output(path, text())
-            say(f"wrote {path}")
+    write_if_asked(json, lambda path: write_output(path, report.to_json()))
+    write_if_asked(page, lambda path: write_output(path, to_page(report)))
 
 
 def print_bench(report: BenchReport) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,7 +20,7 @@ from selective_depth.app.evaluation.evaluate import Outcome, Results, check_name
 from selective_depth.app.evaluation.over_time import Course, over_time, truth_of
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategy_of
 from selective_depth.app.pictures import WIDTH_IN, Panel, depth_panel, error_panel, sheet, shots_panel, write_picture
-from selective_depth.app.pipeline import say
+from selective_depth.app.pipeline import say, write_if_asked
 from selective_depth.app.settings import ComparisonOptions, EvaluationFiles, PictureOptions, Settings
 from selective_depth.drivers.frame import DepthFrame
 from selective_depth.selectors.acquire import acquire, shots_of
@@ -85,17 +85,11 @@ def run_evaluation(
         frame = next(frames_of(sources, options.every, 1))
         return comparison(Case(frame, settings, shots_of(options.budget[0], frame.shape), options.rounds), page.width)
 
-    outputs: list[tuple[Path | None, Callable[[Path], None]]] = [
-        (files.json, lambda path: write_output(path, to_json(found, options, settings))),
-        (files.table, lambda path: write_table(path, found)),
-        (files.page, lambda path: write_output(path, to_markdown(found))),
-        (files.picture, lambda path: write_picture(path, first_frame(), page.dpi)),
-        (files.curves, lambda path: write_picture(path, curves(found, page.width), page.dpi)),
-    ]
-    for path, write in outputs:
-        if path is not None:
-            write(path)
-            say(f"wrote {path}")
+    write_if_asked(files.json, lambda path: write_output(path, to_json(found, options, settings)))
+    write_if_asked(files.table, lambda path: write_table(path, found))
+    write_if_asked(files.page, lambda path: write_output(path, to_markdown(found)))
+    write_if_asked(files.picture, lambda path: write_picture(path, first_frame(), page.dpi))
+    write_if_asked(files.curves, lambda path: write_picture(path, curves(found, page.width), page.dpi))
 
 
 def _percent(budget: str) -> str:
@@ -265,13 +259,11 @@ def _run_over_time(
         if files.picture is not None and len(found) == 1:
             write_picture(files.picture, _memory_picture(frame, step))
             say(f"wrote {files.picture}")
-    if files.json is not None:
-        document = {
-            "over_time": {uri: {way: asdict(course) for way, course in ways.items()} for uri, ways in found.items()},
-            "budget": budget,
-        }
-        write_output(files.json, json.dumps(document, indent=1) + "\n")
-        say(f"wrote {files.json}")
+    document = {
+        "over_time": {uri: {way: asdict(course) for way, course in ways.items()} for uri, ways in found.items()},
+        "budget": budget,
+    }
+    write_if_asked(files.json, lambda path: write_output(path, json.dumps(document, indent=1) + "\n"))
 
 
 def _memory_picture(frame: DepthFrame, step: TemporalStep) -> Figure:

@@ -12,6 +12,7 @@ from selective_depth.app.pipeline.report import (
     print_report,
     save_settings,
     say,
+    write_if_asked,
 )
 from selective_depth.app.pipeline.result import FrameResult, Model, SensorNote, figures_of
 from selective_depth.app.pipeline.selecting import SELECTOR_NAMES, gas_of, improvement_of, selector_of
@@ -42,4 +43,5 @@ __all__ = [
     "say",
     "selector_of",
     "state_of",
+    "write_if_asked",
 ]

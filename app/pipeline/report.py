@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -47,10 +47,8 @@ class Mean:
 
 def mean_of(values: Iterable[float]) -> float:
     """Mean of the finite ones of some values; NaN of none."""
-    mean = Mean()
-    for value in values:
-        mean.add(value)
-    return mean.value
+    known = [value for value in values if math.isfinite(value)]
+    return sum(known) / len(known) if known else math.nan
 
 
 @dataclass
@@ -161,6 +159,13 @@ def gain_of(figures: Mapping[str, float]) -> str:
 def say(sentence: str) -> None:
     """Print a sentence on standard output."""
     print(sentence, flush=True)
+
+
+def write_if_asked(path: Path | None, write: Callable[[Path], None]) -> None:
+    """Write a file, if one was asked for, and say so."""
+    if path is not None:
+        write(path)
+        say(f"wrote {path}")
 
 
 def print_report(report: RunReport) -> None:
