@@ -17,7 +17,7 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExe
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import islice, product
 
 import numpy as np
 
@@ -149,15 +149,10 @@ def _end_with_parent() -> None:
 def frames_of(sources: Sequence[str], every: int, frames: int | None) -> Iterator[DepthFrame]:
     """Every n-th frame of each source that has any depth, up to a number of frames from each."""
     for uri in sources:
-        taken = 0
         with open_source(uri) as source:
-            endless = source.frame_count is None
-            for frame in source:
-                if frame.index % every == 0 and frame.depth_mm.any():
-                    yield frame
-                    taken += 1
-                if taken == frames or (endless and frame.index + 1 >= ENDLESS_FRAMES):
-                    break
+            looked_at = islice(source, ENDLESS_FRAMES if source.frame_count is None else None)
+            chosen = (frame for frame in looked_at if frame.index % every == 0 and frame.depth_mm.any())
+            yield from islice(chosen, frames)
 
 
 def check_named(sources: Sequence[str], options: ComparisonOptions) -> None:
