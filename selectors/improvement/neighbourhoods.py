@@ -22,7 +22,7 @@ from selective_depth.selectors.improvement.lattice import LANES
 from selective_depth.selectors.improvement.lattice_tables import LatticeTables, build_tables
 from selective_depth.selectors.improvement.systems import MAX_PIXELS, padded_pixels
 from selective_depth.selectors.improvement.variogram import power_table
-from selective_depth.selectors.seeds import SeedGrid, cell_centres
+from selective_depth.selectors.seeds import SeedGrid
 
 REACH = 1.3
 """Pixels farther than this many times the (wider) pitch from every sample are unknown.
@@ -216,10 +216,3 @@ def windows_of(seeds: SeedGrid, exponent: float) -> Windows:
     rows = np.ascontiguousarray(seeds.rows, np.int32).tobytes()
     columns = np.ascontiguousarray(seeds.columns, np.int32).tobytes()
     return _windows(seeds.frame_shape, rows, columns, exponent)
-
-
-def windows_over(frame_shape: tuple[int, int], lattice: tuple[int, int], exponent: float) -> Windows:
-    """The windows about the cell centres of a lattice of so many rows and columns."""
-    rows = cell_centres(frame_shape[0], lattice[0]).tobytes()
-    columns = cell_centres(frame_shape[1], lattice[1]).tobytes()
-    return _windows(frame_shape, rows, columns, exponent)

@@ -14,11 +14,12 @@ import numpy.typing as npt
 
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Bools, Floats, Longs, checked_map, sample_pairs
-from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_over
+from selective_depth.selectors.improvement.neighbourhoods import Windows, windows_of
 from selective_depth.selectors.improvement.sums import improve_by_sums
 from selective_depth.selectors.improvement.systems import MAX_SAMPLES, Box, krige_window, sample_buffers, window_scratch
 from selective_depth.selectors.improvement.variogram import fit_samples
 from selective_depth.selectors.parallel import in_bands
+from selective_depth.selectors.seeds import SeedGrid
 
 EXPONENT = 1.2
 """The exponent w = 2 - epsilon of the semivariogram (eq. 24); see `app/docs/improvement.md`."""
@@ -91,7 +92,7 @@ def improvement_scattered(
     measured[pixels[:, 1], pixels[:, 0]] = mm
     over = lattice or (min(128, shape[0]), min(128, shape[1]))
     asked = None if where is None else checked_map(where, shape, "where") > 0
-    windows = windows_over(shape, over, exponent)
+    windows = windows_of(SeedGrid.from_array(np.zeros(shape, np.uint8), over), exponent)
     return map_scattered(measured, asked, windows, threads, by_sums=by_sums)
 
 

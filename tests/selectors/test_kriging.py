@@ -177,11 +177,13 @@ def test_degenerate_fits_are_finite_and_sensible():
 
 
 def test_tables_fit_in_memory_for_the_largest_lattice():
-    from selective_depth.selectors.improvement.neighbourhoods import windows_over
+    from selective_depth.selectors.improvement.neighbourhoods import windows_of
+    from selective_depth.selectors.seeds import SeedGrid
 
     for frame, lattice in (((480, 640), (128, 128)), ((1024, 1280), (256, 256)),
                            ((1024, 1280), (64, 64)), ((240, 320), (100, 90))):  # fmt: skip
-        assert sum(table.nbytes for table in windows_over(frame, lattice, 1.4).tables) <= 50e6
+        seeds = SeedGrid.from_array(np.zeros(frame, np.uint8), lattice)
+        assert sum(table.nbytes for table in windows_of(seeds, 1.4).tables) <= 50e6
 
 
 def test_eigenvalues_are_positive_so_that_no_semivariogram_is_singular():
