@@ -225,13 +225,12 @@ class TemporalAcquisition:
         self._frame += 1
         self._alert = max(self._alert - 1, 0)
         sensor = _Sensor(measure, self.shape)
-        changed = np.zeros(self.shape, np.bool_)
-        self._still += 1
-        restarted = self._frame == 0 or not self._look_out(sensor, changed)
-        if restarted:
+        changed = self._look_out(sensor) if self._frame else None
+        restarted = changed is None
+        self._still = 0 if restarted else self._still + 1
+        if changed is None:
             forget_all(self._memory)
-            self._still = 0
-            changed[:] = True
+            changed = np.ones(self.shape, np.bool_)
         settled = self._probation < self._still  # never after a restart
         if settled:
             moved = bool(changed.any())
@@ -268,8 +267,8 @@ class TemporalAcquisition:
         at = np.ix_(self._grid.rows, self._grid.columns)
         return replace(self._grid, depth_mm=self._memory.fused_mm[at])
 
-    def _look_out(self, sensor: _Sensor, changed: Bools) -> bool:
-        """Look whether all is as it was, and fill in where not; False if nothing is."""
+    def _look_out(self, sensor: _Sensor) -> Bools | None:
+        """Look where anything is not as it was, shape (H, W); None if nothing is as it was."""
         share = ALERT_LOOKS if self._alert else CALM_LOOKS
         count = min(round(share * self._shots), len(self._lattice_uv))
         turn = (self._looked + np.arange(count)) % len(self._lattice_uv)
@@ -281,9 +280,9 @@ class TemporalAcquisition:
         z = model_mm[uv[:, 1], uv[:, 0]]
         noise_mm = self.noise.floor_mm + self.noise.per_mm * z * z
         if drift(uv, mm, model_mm, noise_mm) > MOVED:
-            return False
+            return None
         if not against.any():
-            return True
+            return np.zeros(self.shape, np.bool_)
         doubted = uv[against]
         beside = around(doubted, self.shape)[: self._shots - sensor.spent]
         beside_against = contradicts(beside, sensor(beside), model_mm)
@@ -292,7 +291,7 @@ class TemporalAcquisition:
         at = doubted[:, None] + BESIDE + NEAR_PX
         confirmed = np.pad(votes, NEAR_PX)[at[..., 1], at[..., 0]].sum(axis=1) >= FEWEST_CONFIRMED
         if not confirmed.any():
-            return True
+            return np.zeros(self.shape, np.bool_)
         extent = Extent(self.shape, self.threads)
         extent.add(uv, against)
         extent.add(beside, beside_against)
@@ -303,8 +302,7 @@ class TemporalAcquisition:
             new = sensor.unasked(best_pixels(border_px, shots))
             extent.add(new, contradicts(new, sensor(new), model_mm))
         where, _ = extent.changed()
-        changed[:] = maximum_filter(where, 2 * MARGIN_PX + 1)
-        return True
+        return np.asarray(maximum_filter(where, 2 * MARGIN_PX + 1))
 
     def _start(self, sensor: _Sensor, restarted: bool) -> Floats:
         """Acquire the frame as if it were the first, and return the model of it alone."""
