@@ -58,7 +58,6 @@ def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[Ints, float]:
     pitch_px = seed_pitch_px(seeds)
     reach_px = HOLE_PITCHES * pitch_px
     added: list[Longs] = []
-    spent = 0
     centred = False  # whether the middles of the cells are in
     height, width = seeds.frame_shape
     while pitch_px > COARSE_PX and min(len(rows), len(columns)) > 1:
@@ -68,9 +67,8 @@ def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[Ints, float]:
         # Where an axis is full or nearly so, cells have no middles: their sides come at once.
         halve = centred or len(centres) < (len(rows) - 1) * (len(columns) - 1)
         new = np.concatenate(([] if centred else [centres]) + ([sides] if halve else []))
-        if spent + len(new) > SHARE * shots:
+        if sum(map(len, added)) + len(new) > SHARE * shots:
             break
-        spent += len(new)
         added.append(new)
         if halve:
             rows, columns = np.union1d(rows, row_middles), np.union1d(columns, column_middles)
