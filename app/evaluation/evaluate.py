@@ -276,18 +276,10 @@ def summarise(found: Sequence[Outcome]) -> Results:
     results: Results = {}
     peers = {(o.frame, o.budget, o.strategy): o.errors[0].rmse_mm for o in found}
     for budget, name in dict.fromkeys((o.budget, o.strategy) for o in found):
-        ratios: list[float] = []
-        shares: list[float] = []
-        errors: list[Errors] = []
-        for outcome in found:
-            if (outcome.budget, outcome.strategy) != (budget, name):
-                continue
-            errors += outcome.errors
-            uniform, oracle = (peers[outcome.frame, budget, peer] for peer in ("uniform", "oracle"))
-            if uniform > 0:
-                ratios += [error.rmse_mm / uniform for error in outcome.errors]
-            if uniform > oracle:
-                shares += [(uniform - error.rmse_mm) / (uniform - oracle) for error in outcome.errors]
+        of_each = [(o.frame, error) for o in found if (o.budget, o.strategy) == (budget, name) for error in o.errors]
+        held = [(e.rmse_mm, peers[frame, budget, "uniform"], peers[frame, budget, "oracle"]) for frame, e in of_each]
+        ratios = [rmse / uniform for rmse, uniform, _ in held if uniform > 0]
+        shares = [(uniform - rmse) / (uniform - oracle) for rmse, uniform, oracle in held if uniform > oracle]
         figures = {
             "geo": float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-9))))) if ratios else 1.0,
             "worst": max(ratios, default=1.0),
@@ -295,7 +287,7 @@ def summarise(found: Sequence[Outcome]) -> Results:
             "share_min": min(shares, default=0.0),
         }
         for figure in ("rmse_mm", "mae_mm", "wrong", "missed"):
-            figures[figure] = float(np.mean([getattr(error, figure) for error in errors]))
+            figures[figure] = float(np.mean([getattr(error, figure) for _, error in of_each]))
         figures |= {full: figures[short] for short, full in FULL_NAMES.items()}
         results.setdefault(f"{budget:.2f}" if round(budget, 2) == budget else f"{budget:g}", {})[name] = figures
     return results
