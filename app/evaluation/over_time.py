@@ -56,18 +56,13 @@ def truth_of(frame: DepthFrame) -> npt.NDArray[np.uint16]:
 
 def _often_returning(uri: str, frames: int | None) -> npt.NDArray[np.bool_] | None:
     """Pixels that return depth in more than half of the frames, if the scene is still; else None."""
-    first: npt.NDArray[np.uint16] | None = None
-    returned, count = np.zeros(1, np.int64), 0
+    before: npt.NDArray[np.uint16] | None = None
+    returned, count = np.zeros((), np.int64), 0
     for frame in _frames(uri, frames):
-        if frame.truth_mm is None:
+        if frame.truth_mm is None or not (before is None or np.array_equal(before, frame.truth_mm)):
             return None
-        if first is None:
-            first, returned = frame.truth_mm, np.zeros(frame.shape, np.int64)
-        if not np.array_equal(first, frame.truth_mm):
-            return None
-        returned += frame.depth_mm > 0
-        count += 1
-    return None if first is None else returned > count / 2
+        before, returned, count = frame.truth_mm, returned + (frame.depth_mm > 0), count + 1
+    return None if before is None else returned > count / 2
 
 
 def over_time(
@@ -136,6 +131,6 @@ def _median(frames: deque[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
     stack = np.sort(np.stack(frames), axis=0)  # NaN last
     count = np.count_nonzero(~np.isnan(stack), axis=0)
     lower = np.take_along_axis(stack, np.maximum(count - 1, 0)[None] // 2, axis=0)[0]
-    upper = np.take_along_axis(stack, np.maximum(count // 2, 0)[None], axis=0)[0]
+    upper = np.take_along_axis(stack, count[None] // 2, axis=0)[0]
     middle: npt.NDArray[np.float32] = np.where(count > 0, (lower + upper) / 2, 0)
     return middle
