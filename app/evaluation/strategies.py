@@ -97,13 +97,17 @@ class Case:
         if len(pixels) > self.shots:
             order = np.argpartition(-worth.ravel()[pixels], self.shots - 1)
             pixels = pixels[order[: self.shots]]
-        width = self.frame.camera.width
-        shots = np.stack((pixels % width, pixels // width), axis=-1).astype(np.int32)
-        return np.concatenate((self.seed_uv, shots))
+        return np.concatenate((self.seed_uv, _pixels(pixels, self.frame.shape)))
 
     def spread(self, mask: npt.NDArray[np.bool_]) -> Pixels:
         """Seeds, and the budget spread evenly over a mask; what does not fit goes elsewhere."""
         return self.best(spread(mask))
+
+
+def _pixels(places: npt.NDArray[np.intp], shape: tuple[int, int]) -> Pixels:
+    """Pixels, column first, of places in a flattened frame."""
+    rows, columns = np.unravel_index(places, shape)
+    return np.stack((columns, rows), axis=-1).astype(np.int32)
 
 
 def _loop(case: Case, rounds: int, selector: Selector | Worth | None = None) -> Pixels:
@@ -129,9 +133,7 @@ def _oracle(case: Case) -> Pixels:
         ordered[error_mm.ravel() == 0] = 0
         pixels = np.argpartition(-ordered, due - 1)[:due] if due else np.empty(0, np.int64)
         pixels = pixels[ordered[pixels] > 0]
-        width = case.frame.camera.width
-        new = np.stack((pixels % width, pixels // width), axis=-1).astype(np.int32)
-        uv = np.concatenate((uv, new))
+        uv = np.concatenate((uv, _pixels(pixels, case.frame.shape)))
     return uv
 
 
