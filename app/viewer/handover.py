@@ -68,7 +68,7 @@ class Handover:
     def wait_empty(self, timeout_s: float) -> bool:
         """Wait until the sink has taken everything, or has failed; False if it has not in time."""
         with self._changed:
-            return self._changed.wait_for(lambda: bool(self.failure) or self._idle(), timeout_s)
+            return self._changed.wait_for(lambda: bool(self.failure) or not (self._queue or self._in_hand), timeout_s)
 
     def finish(self, timeout_s: float) -> bool:
         """Let the sink take what is waiting, and close it.
@@ -88,9 +88,6 @@ class Handover:
                 self.dropped += len(self._queue) + self._in_hand
                 return False
         return True
-
-    def _idle(self) -> bool:
-        return not self._queue and not self._in_hand
 
     def _full(self) -> bool:
         return self.failure is None and len(self._queue) >= self._capacity

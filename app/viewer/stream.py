@@ -125,8 +125,7 @@ def save_trainings(path: Path, frame: DepthFrame, trainings: Iterable[tuple[int,
         If the file cannot be written.
     """
     try:
-        with path.open("wb"):
-            pass
+        path.write_bytes(b"")
     except OSError as error:
         raise cannot_write(path, error) from None
     never_wait_at_exit()
