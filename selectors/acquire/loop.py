@@ -181,27 +181,23 @@ def acquire(
     chosen_by = selector or best_selector(rounds, threads)
     plan = plan_of(chosen_by, samples)
     lattice_mm = seeds.depth_mm.ravel()
-    uv, depth = [seeds.lattice_uv.reshape(-1, 2)], [lattice_mm]
     whole = _fits_16_bits(lattice_mm) and bool((lattice_mm == np.rint(lattice_mm)).all())
-    made: list[Round] = []
     for due in _shares(total, rounds, len(even_uv)):
-        left = due - sum(r.shots for r in made)
-        wanted = even_uv if len(even_uv) and not made else plan.best(left)
+        left = due - sum(len(uv) for uv, _ in samples.added_since(1))
+        wanted = even_uv if len(even_uv) and samples.additions == 1 else plan.best(left)
         new_uv = _allowed(wanted, samples, left)
         answer, new_mm = answers(measure, new_uv)
         _refuse_metres(new_mm, samples)
         whole &= np.issubdtype(answer.dtype, np.integer) and _fits_16_bits(new_mm)
         samples.book(new_uv, new_mm)
-        uv.append(new_uv)
-        depth.append(new_mm)
-        made.append(Round(len(new_uv), int(np.count_nonzero(new_mm))))
+    uv, depth = zip(*samples.added_since(0), strict=True)
     depth_mm: Floats = np.concatenate(depth)
     return Acquisition(
         np.concatenate(uv),
         depth_mm.astype(np.uint16) if whole else depth_mm,
         np.repeat(np.arange(len(uv), dtype=np.uint8), [len(part) for part in uv]),
         seeds.frame_shape,
-        tuple(made),
+        tuple(Round(len(mm), int(np.count_nonzero(mm))) for mm in depth[1:]),
         getattr(chosen_by, "name", getattr(chosen_by, "__name__", "")),
         plan if isinstance(plan, SurfacePlan) else None,
     )
