@@ -10,8 +10,6 @@ import numpy.typing as npt
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Floats
 
-Image = Floats
-
 # Position of the lowest set bit of a word: multiplied by a de Bruijn sequence, each single bit
 # leaves another number in the top six bits.
 _DE_BRUIJN = np.uint64(0x03F79D71B4CB0A89)
@@ -37,7 +35,7 @@ class StepRule(NamedTuple):
         Greatest gap that counts, pixels; variance where all agree, mm^2.
     """
 
-    weight_of: Image
+    weight_of: Floats
     vote_px: int
     reach_px: float
     voters: int
@@ -47,8 +45,8 @@ class StepRule(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def score_rows(
-    first: int, end: int, image_mm: Image, bits: npt.NDArray[np.uint64], rule: StepRule,
-    score: Image,
+    first: int, end: int, image_mm: Floats, bits: npt.NDArray[np.uint64], rule: StepRule,
+    score: Floats,
 ) -> None:  # fmt: skip
     """Score some rows of pixels, mm^2 times pixels; 0 where no shot is to be made.
 
