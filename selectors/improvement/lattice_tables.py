@@ -36,7 +36,6 @@ SEEDS = 9
 """Seeds in a window without holes."""
 CONTRASTS = SEEDS - 1
 """Dimensions of a window's system once the mean is taken out."""
-_ONE_OF_EACH = ("between", "basis", "eigenvalues", "distance_sums", "moments")  # a geometry
 
 
 class LatticeTables(NamedTuple):
@@ -99,11 +98,7 @@ def build_tables(geometries: list[tuple[int, int, int, int]], exponent: float) -
     parts = [_tabulate(*geometry, exponent) for geometry in geometries]
     tables: dict[str, npt.NDArray[Any]] = {}
     for name in parts[0]:
-        arrays = [part[name] for part in parts]
-        if name in _ONE_OF_EACH:
-            whole = np.stack(arrays)
-        else:
-            whole = np.concatenate(arrays, axis=1 if name == "distances" else 0)
+        whole = np.concatenate([part[name] for part in parts], axis=1 if name == "distances" else 0)
         tables[name] = whole if name in ("between", "is_seed") else aligned_empty(*whole.shape)
         tables[name][...] = whole
     for name, table in (("first_pixel", "is_seed"), ("first_pair", "bases")):
@@ -137,14 +132,14 @@ def _tabulate(up: int, down: int, left: int, right: int, exponent: float) -> dic
     other = np.concatenate((itself, across + 1, down_from + width))
     return {
         "distances": np.pad(h, ((0, 0), (0, rest))),
-        "between": H,
+        "between": H[None],
         "vectors": np.pad(g.T, ((0, rest), (0, 0))),
         "is_seed": np.pad((h == 0).any(axis=0), (0, rest)),
         "products": (g[:, one] * g[:, other]).T,
         # Neighbouring pixels are 1 apart, and 1^w = 1.
         "bases": f[one] + f[other] - (one != other),
-        "basis": V.T,
-        "eigenvalues": eigenvalues,
-        "distance_sums": H.sum(axis=1),
-        "moments": np.array((H.sum() / 2, (H**2).sum() / 2)),
+        "basis": V.T[None],
+        "eigenvalues": eigenvalues[None],
+        "distance_sums": H.sum(axis=1)[None],
+        "moments": np.array([(H.sum() / 2, (H**2).sum() / 2)]),
     }
