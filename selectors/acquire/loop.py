@@ -112,10 +112,6 @@ def _shares(shots: int, rounds: int, first: int) -> list[int]:
     return given + [first + (shots - first) * (n + 1) // count for n in range(count)]
 
 
-def _fits_16_bits(depth_mm: Floats) -> bool:
-    return bool(depth_mm.max(initial=0) <= np.iinfo(np.uint16).max)
-
-
 def best_selector(rounds: int, threads: int | None = None) -> Selector:
     """The selector that `acquire` takes by default: the best there is for so many rounds.
 
@@ -181,20 +177,20 @@ def acquire(
     chosen_by = selector or best_selector(rounds, threads)
     plan = plan_of(chosen_by, samples)
     lattice_mm = seeds.depth_mm.ravel()
-    whole = _fits_16_bits(lattice_mm) and bool((lattice_mm == np.rint(lattice_mm)).all())
+    whole = bool((lattice_mm == np.rint(lattice_mm)).all())
     for due in _shares(total, rounds, len(even_uv)):
         left = due - sum(len(uv) for uv, _ in samples.added_since(1))
         wanted = even_uv if len(even_uv) and samples.additions == 1 else plan.best(left)
         new_uv = _allowed(wanted, samples, left)
         answer, new_mm = answers(measure, new_uv)
         _refuse_metres(new_mm, samples)
-        whole &= np.issubdtype(answer.dtype, np.integer) and _fits_16_bits(new_mm)
+        whole &= np.issubdtype(answer.dtype, np.integer)
         samples.book(new_uv, new_mm)
     uv, depth = zip(*samples.added_since(0), strict=True)
     depth_mm: Floats = np.concatenate(depth)
     return Acquisition(
         np.concatenate(uv),
-        depth_mm.astype(np.uint16) if whole else depth_mm,
+        depth_mm.astype(np.uint16) if whole and depth_mm.max() <= np.iinfo(np.uint16).max else depth_mm,
         np.repeat(np.arange(len(uv), dtype=np.uint8), [len(part) for part in uv]),
         seeds.frame_shape,
         tuple(Round(len(mm), int(np.count_nonzero(mm))) for mm in depth[1:]),
