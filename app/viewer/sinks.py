@@ -106,11 +106,6 @@ class Sink(ABC):
         else:
             self._recording.abandon()
 
-    @property
-    def _what(self) -> tuple[str, ViewerOptions]:
-        """What any recording is made with."""
-        return self.showing.application, self.showing.options
-
     @abstractmethod
     def _connect(self) -> Recording:
         """Open the recording that the results go to."""
@@ -172,7 +167,7 @@ class FileSink(Sink):
             self.path.unlink(missing_ok=True)
 
     def _connect(self) -> Recording:
-        return Recording.to_file(self.path, *self._what, index=self._index)
+        return Recording.to_file(self.path, self.showing.application, self.showing.options, index=self._index)
 
     def _make_sure(self, patience_s: float = WRITE_S) -> None:
         assert self._recording is not None
@@ -203,7 +198,7 @@ class ServedSink(Sink):
             target = rr.GrpcServerSink(
                 self.host, self.port, server_memory_limit=options.serve_memory, cors_allow_origin=origins
             )
-            recording = Recording(target, *self._what)
+            recording = Recording(target, self.showing.application, options)
         except RuntimeError as error:
             raise ViewerError(f"cannot serve on {self.host}:{self.port}: {error}.") from None
         deadline_s = time.monotonic() + SERVE_S
@@ -277,7 +272,7 @@ class RemoteSink(Sink):
         self.showing.tell(f"The {self.name} was closed; the run goes on without it.")
 
     def _connect(self) -> Recording:
-        return Recording(rr.GrpcSink(self.url), *self._what)
+        return Recording(rr.GrpcSink(self.url), self.showing.application, self.showing.options)
 
 
 class WindowSink(RemoteSink):
