@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,14 +44,12 @@ def owner_of(port: int) -> Owner:
         if state == _LISTENING and int(local.rpartition(":")[2], 16) == port:
             links.add(f"socket:[{inode}]")
     for process in _PROC.glob("[0-9]*"):
-        try:
+        with suppress(OSError):  # another user's, or it has just ended
             if any(str(handle.readlink()) in links for handle in (process / "fd").iterdir()):
                 theirs = (process / "environ").read_bytes().split(b"\0")
                 program = (process / "exe").resolve()
                 same = all(_same(name, theirs) for name in SCREENS)
                 return Owner(int(process.name), program, same)
-        except OSError:
-            continue  # another user's, or it has just ended
     return Owner(None, None, same_screen=False)
 
 

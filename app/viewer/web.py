@@ -6,13 +6,13 @@ import os
 import socket
 import subprocess
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from urllib.parse import quote
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import ViewerError
-from selective_depth.app.viewer.window import PORTS, listens, local_url, viewer_executable
+from selective_depth.app.viewer.window import PORTS, listens, local_url, needed_executable
 
 WEB_PORTS = range(9090, 9100)
 """Where browsers find it; the first is Rerun's own default."""
@@ -20,7 +20,7 @@ BIRTH_S = 10.0
 """How long it may take to listen."""
 
 
-def free_port(host: str, ports: Iterable[int]) -> int:
+def free_port(host: str, ports: Sequence[int]) -> int:
     """The first of some ports that is free.
 
     Raises
@@ -28,13 +28,9 @@ def free_port(host: str, ports: Iterable[int]) -> int:
     ViewerError
         If all are taken.
     """
-    ports = list(ports)
     for port in ports:
-        try:
-            with socket.create_server((host, port)):
-                return port
-        except OSError:
-            continue
+        with suppress(OSError), socket.create_server((host, port)):
+            return port
     raise ViewerError(f"the ports {ports[0]}..{ports[-1]} of {host} are all taken. End one of the programs there.")
 
 
@@ -61,11 +57,8 @@ def serving_web_viewer(host: str, stream: int) -> Iterator[int]:
     ViewerError
         If it does not start.
     """
-    executable = viewer_executable()
-    if executable is None:
-        raise ViewerError("there is no program 'rerun'. Install it with: pip install --force-reinstall rerun-sdk.")
     port = free_port(host, WEB_PORTS)
-    command = [executable, "--serve-web", "--bind", host, "--web-viewer-port", str(port), local_url(stream)]
+    command = [needed_executable(), "--serve-web", "--bind", host, "--web-viewer-port", str(port), local_url(stream)]
     if os.name == "posix":  # it goes when this program does, however that ends: their pipe is closed then
         command = ["sh", "-c", '"$@" & read -r _; kill -9 $!; wait $!', "sh", *command]
     quiet = subprocess.DEVNULL

@@ -211,12 +211,7 @@ def start(
     write, hands it this program's output (so that a pipe from here never ends), and takes 20 s
     to notice that it died.
     """
-    executable = viewer_executable()
-    if executable is None:
-        raise ViewerError(
-            "the viewer window does not start: there is no program 'rerun'. Install it with: pip"
-            " install --force-reinstall rerun-sdk."
-        )
+    executable = needed_executable()
     command = [executable, "--bind", "127.0.0.1", "--port", str(port)]
     command += ["--memory-limit", options.viewer_memory]
     command += ["--server-memory-limit", options.serve_memory]
@@ -285,6 +280,20 @@ def viewer_executable() -> str | None:
             if native.is_file():
                 return str(native)
     return shutil.which("rerun")
+
+
+def needed_executable() -> str:
+    """The viewer that came with the SDK, else the first on the PATH.
+
+    Raises
+    ------
+    ViewerError
+        If there is none, saying how to get it.
+    """
+    executable = viewer_executable()
+    if executable is None:
+        raise ViewerError("there is no program 'rerun'. Install it with: pip install --force-reinstall rerun-sdk.")
+    return executable
 
 
 def join_command(url: str) -> str:
