@@ -23,7 +23,6 @@ import numpy as np
 
 from selective_depth.app.archive import engine
 from selective_depth.app.console import interrupt
-from selective_depth.app.console.errors import UsageError
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategies_of, strategy_of
 from selective_depth.app.pipeline import open_and_tell
 from selective_depth.app.settings import ComparisonOptions, Settings
@@ -155,14 +154,6 @@ def frames_of(sources: Sequence[str], every: int, frames: int | None) -> Iterato
             yield from islice(chosen, frames)
 
 
-def check_named(sources: Sequence[str], options: ComparisonOptions) -> None:
-    """Refuse a comparison without a source or without a budget."""
-    if not sources:
-        raise UsageError("no source was named; give recordings, folders or scenes.")
-    if not options.budget:
-        raise UsageError("--budget names no share; give one or more, such as 5% 10%.")
-
-
 def outcomes(
     sources: Sequence[str],
     options: ComparisonOptions,
@@ -186,11 +177,10 @@ def outcomes(
     Raises
     ------
     UsageError
-        If there is no source, no budget or no such strategy.
+        If there is no such strategy.
     SourceNotFoundError
         If the sources hold no frame with depth.
     """
-    check_named(sources, options)
     wanted = {*strategies_of(options.strategies), "uniform", "oracle"}
     names = [n for n in STRATEGIES if n in wanted] + sorted(wanted.difference(STRATEGIES))
     jobs = options.jobs or default_threads()

@@ -14,9 +14,10 @@ import pyarrow as pa
 from selective_depth.app import __version__
 from selective_depth.app.console import tables
 from selective_depth.app.console.columns import print_table
+from selective_depth.app.console.errors import UsageError
 from selective_depth.app.console.output import check_output, check_picture, write_output
 from selective_depth.app.console.progress import FrameProgress
-from selective_depth.app.evaluation.evaluate import Outcome, Results, check_named, frames_of, outcomes, summarise
+from selective_depth.app.evaluation.evaluate import Outcome, Results, frames_of, outcomes, summarise
 from selective_depth.app.evaluation.over_time import Course, over_time, truth_of
 from selective_depth.app.evaluation.strategies import STRATEGIES, Case, strategy_of
 from selective_depth.app.pictures import WIDTH_IN, Panel, depth_panel, error_panel, sheet, shots_panel, write_picture
@@ -68,9 +69,13 @@ def run_evaluation(
     Raises
     ------
     UsageError, OutputError
-        If there is no such strategy or a file cannot be written; refused before the work is done
-        where possible.
+        If there is no source, no budget or no such strategy, or a file cannot be written; refused before
+        the work is done where possible.
     """
+    if not sources:
+        raise UsageError("no source was named; give recordings, folders or scenes.")
+    if not options.budget:
+        raise UsageError("--budget names no share; give one or more, such as 5% 10%.")
     for picture in (files.picture, files.curves):
         check_picture(picture)
     check_output(files.json, files.page)
@@ -242,12 +247,9 @@ def _run_over_time(
 
     Raises
     ------
-    UsageError
-        If there is no source or no budget.
     OutputError
         If a file cannot be written.
     """
-    check_named(sources, options)
     budget = float(options.budget[0])
     found: dict[str, dict[str, Course]] = {}
     for uri in sources:
