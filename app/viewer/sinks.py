@@ -19,7 +19,7 @@ from selective_depth.app.console.output import cannot_write, lock
 from selective_depth.app.pipeline import FrameResult, SensorNote, StageTimes
 from selective_depth.app.settings import ViewerOptions
 from selective_depth.app.viewer.stream import WRITE_S, Recording
-from selective_depth.app.viewer.window import PORTS, ask, get_window, listens, local_url, look_at
+from selective_depth.app.viewer.window import PORTS, ask, comes_to_listen, get_window, listens, local_url, look_at
 from selective_depth.drivers.errors import OutputError
 
 CHECK_EVERY_S = 1.0
@@ -201,14 +201,11 @@ class ServedSink(Sink):
             recording = Recording(target, self.showing.application, options)
         except RuntimeError as error:
             raise ViewerError(f"cannot serve on {self.host}:{self.port}: {error}.") from None
-        deadline_s = time.monotonic() + SERVE_S
-        while not listens((self.host, self.port)):
-            if time.monotonic() > deadline_s:
-                raise ViewerError(
-                    f"cannot serve on {self.host}:{self.port}: the server does not listen within"
-                    f" {SERVE_S:g} s. Give another --serve-address."
-                )
-            time.sleep(0.01)
+        if not comes_to_listen((self.host, self.port), SERVE_S):
+            raise ViewerError(
+                f"cannot serve on {self.host}:{self.port}: the server does not listen within"
+                f" {SERVE_S:g} s. Give another --serve-address."
+            )
         return recording
 
 

@@ -140,10 +140,7 @@ class Viewer:
     @property
     def served_url(self) -> str:
         """Address at which viewers join; empty if nothing is served, or no more."""
-        for way in self._ways:
-            if isinstance(way.sink, ServedSink) and way.failure is None:
-                return way.sink.url
-        return ""
+        return next((way.sink.url for way in self._ways if isinstance(way.sink, ServedSink) and not way.failure), "")
 
     def wait_ready(self) -> None:
         """Wait until every sink is open, though for none that stalls."""

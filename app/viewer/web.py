@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from urllib.parse import quote
 
 from selective_depth.app.console import interrupt
 from selective_depth.app.console.errors import ViewerError
-from selective_depth.app.viewer.window import PORTS, listens, local_url, needed_executable
+from selective_depth.app.viewer.window import PORTS, comes_to_listen, local_url, needed_executable
 
 WEB_PORTS = range(9090, 9100)
 """Where browsers find it; the first is Rerun's own default."""
@@ -65,11 +64,9 @@ def serving_web_viewer(host: str, stream: int) -> Iterator[int]:
     with interrupt.started_deaf():
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet)
     try:
-        deadline_s = time.monotonic() + BIRTH_S
-        while not listens(("127.0.0.1" if host == "0.0.0.0" else host, port)):
-            if process.poll() is not None or time.monotonic() > deadline_s:
-                raise ViewerError(f"the viewer for browsers does not start on {host}:{port}.")
-            time.sleep(0.05)
+        address = ("127.0.0.1" if host == "0.0.0.0" else host), port
+        if not comes_to_listen(address, BIRTH_S, lambda: process.poll() is None):
+            raise ViewerError(f"the viewer for browsers does not start on {host}:{port}.")
         yield port
     finally:
         process.communicate() if os.name == "posix" else process.kill()

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Container
+from collections.abc import Callable, Container
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -102,6 +102,14 @@ def listens(address: tuple[str, int]) -> bool:
             return True
     except OSError:
         return False
+
+
+def comes_to_listen(address: tuple[str, int], patience_s: float, alive: Callable[[], bool] = lambda: True) -> bool:
+    """Wait until somebody accepts connections at an address; False if that takes too long, or nobody is `alive`."""
+    deadline_s = time.monotonic() + patience_s
+    while not (there := listens(address)) and alive() and time.monotonic() < deadline_s:
+        time.sleep(0.02)
+    return there
 
 
 def local_url(port: int) -> str:
