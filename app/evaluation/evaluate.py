@@ -224,15 +224,14 @@ def _processes(jobs: int) -> Iterator[Executor]:
     spawn = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_worker)
-    done = False
     try:
         yield pool
-        done = True
-    finally:
-        if not done:  # after Ctrl-C, say: what is under way is not waited for
-            for worker in set(multiprocessing.active_children()) - others:
-                worker.kill()
-        pool.shutdown(wait=done, cancel_futures=True)
+    except BaseException:  # Ctrl-C, say: what is under way is not waited for
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.kill()
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    pool.shutdown()
 
 
 def _through(
