@@ -84,7 +84,12 @@ class Viewer:
                     sink.discard()
             raise
         self._ways = [_handover(sink, live) for sink in self._sinks]
-        self._see_served()
+        for way in self._ways:
+            if isinstance(way.sink, ServedSink):  # whoever is told of it may join at once
+                way.ready.wait(READY_S)
+                if way.failure is not None:
+                    self.close()
+                    raise way.failure
 
     def _open_all(self, showing: Showing, fallback: Path | None) -> None:
         options = self.options
@@ -123,15 +128,6 @@ class Viewer:
             ) from None
         self._sinks.insert(0, FileSink(path, showing, index=self._index))
         self.options = dataclasses.replace(self.options, save=path)
-
-    def _see_served(self) -> None:
-        """Wait until the stream, if one is to be served, is served."""
-        for way in self._ways:
-            if isinstance(way.sink, ServedSink):
-                way.ready.wait(READY_S)
-                if way.failure is not None:
-                    self.close()
-                    raise way.failure
 
     def news(self) -> list[str]:
         """What has happened to the sinks since the last call, a sentence each."""
