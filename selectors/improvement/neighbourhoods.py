@@ -198,8 +198,7 @@ def _windows(frame_shape: tuple[int, int], rows: bytes, columns: bytes, exponent
     at_rows, at_columns = np.frombuffer(rows, np.int32), np.frombuffer(columns, np.int32)
     axes = (height, at_rows), (width, at_columns)
     reach_px = REACH * max((pixels / len(at) for pixels, at in axes if len(at) > 1), default=LONE_PITCH)
-    row_axis = Axis.of(height, at_rows, reach_px)
-    column_axis = Axis.of(width, at_columns, reach_px)
+    row_axis, column_axis = (Axis.of(pixels, at, reach_px) for pixels, at in axes)
     widest = max(row_axis.longest, column_axis.longest)
     windows = Windows(row_axis, column_axis, reach_px, power_table(exponent, 2 * widest + 2), exponent)
     if windows.most_pixels > MAX_PIXELS:
