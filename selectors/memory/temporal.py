@@ -253,7 +253,7 @@ class TemporalAcquisition:
             batch=np.repeat(np.minimum(np.arange(len(sensor.uv)), 255).astype(np.uint8), [len(uv) for uv in sensor.uv]),
             model_mm=model_mm,
             known_mm=self._memory.fused_mm.copy(),
-            seeds=self._seeds(),
+            seeds=replace(self._grid, depth_mm=self._memory.fused_mm[np.ix_(self._grid.rows, self._grid.columns)]),
             known=known,
             age_frames=np.where(known, self._frame - self._memory.asked, -1).astype(np.int32),
             changed=changed,
@@ -261,11 +261,6 @@ class TemporalAcquisition:
             settled=settled,
             by=self._by,
         )
-
-    def _seeds(self) -> SeedGrid:
-        """The lattice as it is known."""
-        at = np.ix_(self._grid.rows, self._grid.columns)
-        return replace(self._grid, depth_mm=self._memory.fused_mm[at])
 
     def _look_out(self, sensor: _Sensor) -> Bools | None:
         """Look where anything is not as it was, shape (H, W); None if nothing is as it was."""
