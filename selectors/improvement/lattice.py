@@ -165,7 +165,7 @@ def _fit_lanes(padded, i, order, batch, tables, geometry, s):  # type: ignore[no
             s[_MEAN + n] += s[_DEPTH + k * LANES + n]
     for n in range(LANES):
         s[_MEAN + n] *= np.float32(1.0 / SEEDS)
-    # _A and _B hold the moments t0 and t1 of `semivariogram.fit_moments` for a while, doubled.
+    # _A and _B hold the moments t0 and t1 of `variogram.fit_moments` for a while, doubled.
     for n in range(LANES):
         s[_A + n] = np.float32(0.0)
         s[_B + n] = np.float32(0.0)
