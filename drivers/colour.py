@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from selective_depth.drivers.frame import MOST_PX, Camera, ColourArray, DepthArray, DepthFrame
+from selective_depth.drivers.frame import MOST_PX, Camera, ColourArray, DepthArray, DepthFrame, handed_over
 from selective_depth.drivers.options import Options
 
 PAIR_US: Final = 20_000
@@ -64,8 +64,7 @@ def rgb_of(data: Any, kind: str, width: int, height: int) -> ColourArray | None:
         return None
     raw = raw[: width * height * size].reshape(height, width, size)
     image = raw.copy() if conversion is None else cv2.cvtColor(raw, conversion)
-    image.flags.writeable = False  # handed over: the frame need not copy it
-    return np.asarray(image, np.uint8)
+    return handed_over(np.asarray(image, np.uint8))
 
 
 def rgb_of_file(file: Path | io.BytesIO) -> ColourArray | None:
@@ -77,11 +76,9 @@ def rgb_of_file(file: Path | io.BytesIO) -> ColourArray | None:
         with Image.open(file) as image:
             if image.width * image.height > MOST_PIXELS:
                 return None
-            colour = np.array(image.convert("RGB"), np.uint8)
+            return handed_over(np.array(image.convert("RGB"), np.uint8))
     except (*DAMAGED, *BOMBS):
         return None
-    colour.flags.writeable = False  # handed over: the frame need not copy it
-    return colour
 
 
 def jpeg_of(colour: ColourArray, quality: int) -> bytes:
@@ -195,5 +192,4 @@ def on_depth(
     v = ((rows - camera.cy) * (z / camera.fy) - place_mm[1]) / away * colour_camera.fy + colour_camera.cy
     u[depth_mm == 0] = -1e6
     laid: npt.NDArray[Any] = cv2.remap(colour, u.astype(np.float32), v.astype(np.float32), cv2.INTER_NEAREST)
-    laid.flags.writeable = False
-    return laid
+    return handed_over(laid)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,7 @@ DepthArray = npt.NDArray[np.uint16]
 """Depth image, shape (height, width), millimetres, 0 = no measurement."""
 ColourArray = npt.NDArray[np.uint8]
 """Colour image, shape (height, width, 3), red-green-blue."""
+_Value = TypeVar("_Value", bound=np.generic)
 
 MOST_PX = 1e6
 """Greatest focal length, and farthest principal point, of any camera: so that no metric point of
@@ -251,11 +252,16 @@ def _check_time(name: str, time_us: int) -> None:
 
 def _kept(image: npt.NDArray[Any], kind: type[np.generic]) -> npt.NDArray[Any]:
     """An image that nobody can change: itself, where that is so already, or a copy."""
-    handed_over = type(image) is np.ndarray and image.base is None and not image.flags.writeable
-    if not (handed_over and image.flags.c_contiguous and image.dtype.isnative):
-        # A sensor fills its buffer again: a frame that is kept stays what it was.
-        image = np.array(np.ma.filled(image, 0), kind, order="C")
-        image.flags.writeable = False
+    own = type(image) is np.ndarray and image.base is None and not image.flags.writeable
+    if own and image.flags.c_contiguous and image.dtype.isnative:
+        return image
+    # A sensor fills its buffer again: a frame that is kept stays what it was.
+    return handed_over(np.array(np.ma.filled(image, 0), kind, order="C"))
+
+
+def handed_over(image: npt.NDArray[_Value]) -> npt.NDArray[_Value]:
+    """An image that its maker will not change any more: a frame need not copy it."""
+    image.flags.writeable = False
     return image
 
 

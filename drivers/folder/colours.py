@@ -46,8 +46,7 @@ class Colours:
     ) -> None:
         self.about, self.notes = "", ()  # type: tuple[str, tuple[str, ...]]
         camera = sidecar.colour_camera
-        told = (camera.fx, camera.fy, camera.cx, camera.cy) if camera else None
-        self._colouring = colouring.told_by(told, sidecar.colour_place_mm)
+        self._colouring = colouring.told_by(camera.intrinsics if camera else None, sidecar.colour_place_mm)
         self._registered = found.row.registered if sidecar.colour_registered is None else sidecar.colour_registered
         self._images = _paired(found, timestamps_us, sidecar.colour_timestamps_us) if colouring.wanted else []
         files = [image[1] for image in self._images if image]

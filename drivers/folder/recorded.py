@@ -24,7 +24,7 @@ from selective_depth.drivers.folder.colours import Colours
 from selective_depth.drivers.folder.images import damaged, read_raw, read_size, read_stack
 from selective_depth.drivers.folder.layouts import ARRAYS, Found, doubtful_order, find_layout
 from selective_depth.drivers.folder.sidecar import MILLIMETRES, SIDECAR, Sidecar, read_sidecar
-from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame, millimetres
+from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame, handed_over, millimetres
 from selective_depth.drivers.source import DEFAULT_FPS, DepthSource
 
 _LOOKS: Final = 5
@@ -162,8 +162,7 @@ class RecordedFolder(DepthSource):
             timestamp_us = round(index * 1e6 / self.fps)
         else:
             timestamp_us = self._timestamps_us[index]
-        depth_mm = self._convert(raw)
-        depth_mm.flags.writeable = False  # handed over: the frame need not copy it
+        depth_mm = handed_over(self._convert(raw))
         frame, trouble = self._colours.on(DepthFrame(depth_mm, index, timestamp_us, self.camera, self.uri))
         if trouble and not self._colour_trouble:  # said once
             self._colour_trouble = True

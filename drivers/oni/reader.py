@@ -7,7 +7,7 @@ from typing import BinaryIO
 
 from selective_depth.drivers.colour import ON, Colouring
 from selective_depth.drivers.errors import DamagedRecordingError, SourceEndedError, SourceError
-from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame
+from selective_depth.drivers.frame import Camera, DepthArray, DepthFrame, handed_over
 from selective_depth.drivers.oni.codec import decode_depth
 from selective_depth.drivers.oni.colour import OniColour
 from selective_depth.drivers.oni.files import open_regular, read_payload
@@ -116,8 +116,7 @@ class OniReader(DepthSource):
         depth_mm = self._sides.put_right(depth_mm)
         if self._sides.turns > turns == 0:
             self.notes += (f"'{self.uri}' {turned_at(frame.number)}",)
-        depth_mm.flags.writeable = False  # handed over: the frame need not copy it
-        whole = DepthFrame(depth_mm, self._next, frame.timestamp_us, self.camera, self.uri)
+        whole = DepthFrame(handed_over(depth_mm), self._next, frame.timestamp_us, self.camera, self.uri)
         self._next += 1
         return self._colour.on(self._file, whole, self._colouring)
 

@@ -18,7 +18,7 @@ from selective_depth.drivers.errors import (
     SourceNotFoundError,
     SourceTimeoutError,
 )
-from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.frame import Camera, DepthFrame, handed_over
 from selective_depth.drivers.oni import upright
 from selective_depth.drivers.openni.clock import Count
 from selective_depth.drivers.openni.pairing import Pairing
@@ -183,7 +183,7 @@ class OpenNIDevice(DepthSource):
         if self._colour is not None:
             with suppress(ValueError):
                 seen = Camera.from_fov(*(self._colour[key] for key in _FIELD_OF_VIEW))
-                colouring = colouring.told_by((seen.fx, seen.fy, seen.cx, seen.cy), None)
+                colouring = colouring.told_by(seen.intrinsics)
         self._pairing = Pairing(self._colour is not None, bool(about["registered"]), colouring)
         wanted = (self.settings.width, self.settings.height, self.settings.fps)
         taken = (camera.width, camera.height, int(about["fps"]))
@@ -355,8 +355,7 @@ class OpenNIDevice(DepthSource):
 
     def _arrive(self, message: Message) -> None:
         stored = self._worker.take(message, self.camera.width, self.camera.height)
-        depth_mm = upright(stored, self._tenths, self.settings.mirror)
-        depth_mm.flags.writeable = False  # handed over: the frame need not copy it
+        depth_mm = handed_over(upright(stored, self._tenths, self.settings.mirror))
         number, timestamp_us = self._count.follow(message)
         if self._count.mended:
             self._note_once(

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from selective_depth.drivers.frame import Camera, ColourArray
+from selective_depth.drivers.frame import Camera, ColourArray, handed_over
 from selective_depth.drivers.kernels import njit
 from selective_depth.drivers.virtual.scenes import Material
 
@@ -42,10 +42,8 @@ def paint(
         Red-green-blue, read-only.
     """
     colour = np.empty((*nearness.shape, 3), np.uint8)
-    lens = (camera.fx, camera.fy, camera.cx, camera.cy)
-    _paint(nearness, material, lens, rotation, position_mm, _TINT, _PATTERNED, rotation @ _LAMP, colour)
-    colour.flags.writeable = False
-    return colour
+    _paint(nearness, material, camera.intrinsics, rotation, position_mm, _TINT, _PATTERNED, rotation @ _LAMP, colour)
+    return handed_over(colour)
 
 
 @njit(cache=True, nogil=True)

@@ -94,7 +94,7 @@ def cast(shapes: Shapes, camera: Camera) -> tuple[npt.NDArray[np.float32], npt.N
     """
     nearness = np.zeros((camera.height, camera.width), np.float32)
     material = np.zeros((camera.height, camera.width), np.uint8)
-    _cast(shapes, (camera.fx, camera.fy, camera.cx, camera.cy), nearness, material)
+    _cast(shapes, camera.intrinsics, nearness, material)
     return nearness, material
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from selective_depth.drivers.colour import Colouring
 from selective_depth.drivers.errors import SourceEndedError, SourceNotFoundError, SourceTimeoutError
-from selective_depth.drivers.frame import Camera, ColourArray, DepthArray, DepthFrame, millimetres
+from selective_depth.drivers.frame import Camera, ColourArray, DepthArray, DepthFrame, handed_over, millimetres
 from selective_depth.drivers.options import Options
 from selective_depth.drivers.source import DepthSource
 from selective_depth.drivers.virtual.moving import MOVING, moving_shapes
@@ -123,8 +123,7 @@ class VirtualSource(DepthSource):
         rotation, position_mm = camera_pose(scene, index / FPS * self._speed, self.seed)
         nearness, material = cast(shapes.seen_from(rotation, position_mm), self.camera)
         with np.errstate(divide="ignore"):
-            exact = millimetres(1.0 / nearness, 1000.0)
-        exact.flags.writeable = False
+            exact = handed_over(millimetres(1.0 / nearness, 1000.0))
         colour = paint(nearness, material, self.camera, rotation, position_mm) if coloured else None
         if not noise:
             return exact, exact, colour
