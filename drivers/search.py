@@ -56,7 +56,7 @@ def _below(folder: Path, leave_out: Path | None) -> Iterator[Path]:
         yield folder
         return
     yield from (folder / name for name in files if Path(name).suffix.lower() in FILES)
-    inside = ""
+    inside: list[str] = []
     try:
         found = find_layout(folder)
     except SourceNotFoundError:
@@ -65,18 +65,14 @@ def _below(folder: Path, leave_out: Path | None) -> Iterator[Path]:
         yield folder
         return
     else:
-        way = found.row.depth.rpartition("/")[0]
-        if "*" in way or "[" in way:  # several cameras of one recording
-            yield from sorted({path.parent for path in folder.glob(found.row.depth)})
-        elif way or found.row.depth != "*":
-            yield folder
-        elif SIDECAR in files or any(is_depth_png(found.files[at]) for at in (0, -1)):
-            yield folder
-            inside = found.row.colour
-        if way or found.row.depth != "*":
+        pattern = found.row.depth
+        if pattern != "*":
+            several = set(pattern.rpartition("/")[0]) & set("*[")  # cameras of one recording
+            yield from sorted({path.parent for path in folder.glob(pattern)}) if several else (folder,)
             return
+        if SIDECAR in files or any(is_depth_png(found.files[at]) for at in (0, -1)):
+            yield folder
+            inside = [colour.partition("/")[0] for colour in found.row.colour.split("|")]
     for each in folders:
-        if each.name not in [pattern.partition("/")[0] for pattern in inside.split("|")] and (
-            leave_out is None or each.resolve() != leave_out
-        ):
+        if each.name not in inside and each.resolve() != leave_out:
             yield from _below(each, leave_out)
