@@ -58,11 +58,8 @@ class OniColour:
                 self.camera = node.camera(*self._size)
         self._times_us = [frame.timestamp_us for frame in self.node.frames] if self.node else []
 
-    def read(self, file: BinaryIO, frame: OniFrame) -> ColourArray | None:
+    def image(self, payload: bytes, frame: OniFrame) -> ColourArray | None:
         """The image of a frame of the stream, the right way round; None if it is damaged."""
-        return self._image(read_payload(file, frame), frame)
-
-    def _image(self, payload: bytes, frame: OniFrame) -> ColourArray | None:
         colour = rgb_of(payload, self._kind, *self._size)
         return colour[:, ::-1] if colour is not None and frame.mirrored else colour
 
@@ -73,7 +70,7 @@ class OniColour:
             return frame
         held = self.node.frames[at]
         payload = read_payload(file, held)
-        colour = self._image(payload, held)
+        colour = self.image(payload, held)
         if colour is None:
             return frame
         jpeg = payload if self._kind == "JPEG" and not held.mirrored else None

@@ -354,7 +354,7 @@ class _Inspection:
             return
         sound = []
         for frame in colour.node.frames:
-            if time.monotonic() < deadline_s and colour.read(self.file, frame) is None:
+            if time.monotonic() < deadline_s and colour.image(read_payload(self.file, frame), frame) is None:
                 self.problem(frame.record_offset, f"frame {frame.number} of {colour.node.name} cannot be decoded")
             else:
                 sound.append(frame)

@@ -198,7 +198,6 @@ class OniWriter(FrameWriter):
         self._keep = keep
         self._first: DepthFrame | None = None
         self._first_us = 0
-        self._colour_us: int | None = None
         self._codec = CODEC_TABLE
         self._writer = RecordWriter(Path(path), keep=keep)
 
@@ -236,10 +235,11 @@ class OniWriter(FrameWriter):
         self._writer.add_frame(1, since_us, payload)
 
     def _write_colour(self, first: DepthFrame, colour: ColourArray, time_us: int, jpeg: bytes | None) -> None:
-        fits = first.colour is not None and first.colour.shape == colour.shape
-        if fits and (self._colour_us is None or time_us > self._colour_us):  # else it stands in the file already
-            self._colour_us = time_us
-            self._writer.add_frame(2, time_us - self._first_us, jpeg or jpeg_of(colour, JPEG_QUALITY))
+        if first.colour is None or first.colour.shape != colour.shape:
+            return
+        since_us, written = time_us - self._first_us, self._writer.nodes[2].frames
+        if not written or since_us > written[-1].timestamp_us:  # else it stands in the file already
+            self._writer.add_frame(2, since_us, jpeg or jpeg_of(colour, JPEG_QUALITY))
 
     def read_back(self) -> DepthArray | None:
         """The last frame as it stands in the file; None if it cannot be decoded."""
