@@ -186,11 +186,13 @@ class LiveStream:
 
     def __init__(self, job: dict[str, Any], parent: Parent) -> None:
         like, there = job["like"], devices()
+        remedy = "Close the program that uses it, or pull it out and plug it in again."
         for info in choose(there, job["uri"], like):
-            self.info = info
+            self.info, self.sensor = info, f"The sensor {info['uri']}"
             parent.send("found")
             self.watch = Watch(info["uri"])
-            self._open()
+            with refusing(f"{self.sensor} is there but cannot be opened", remedy=remedy):
+                self.device = Device(info["uri"].encode())
             info["serial"] = self._serial()
             if not (like and like["serial"]) or info["serial"] == like["serial"]:
                 break
@@ -205,7 +207,6 @@ class LiveStream:
         self.colour: Any = None
         self.colour_trouble = ""
         self.registered = False
-        self.sensor = f"The sensor {info['uri']}"
         if not self.device.has_sensor(openni2.SENSOR_DEPTH):
             raise JobError(f"{self.sensor} has no depth camera.")
         with refusing(f"{self.sensor} refuses a depth stream", " Pull it out and plug it in again."):
@@ -213,12 +214,6 @@ class LiveStream:
             self._configure(job["settings"])
         if job["settings"]["colouring"]["wanted"]:
             self._open_colour()
-
-    def _open(self) -> None:
-        uri = self.info["uri"]
-        remedy = "Close the program that uses it, or pull it out and plug it in again."
-        with refusing(f"The sensor {uri} is there but cannot be opened", remedy=remedy):
-            self.device = Device(uri.encode())
 
     def _open_colour(self) -> None:
         """Add the colour stream, where there is one that can be read; depth needs none."""
@@ -340,9 +335,8 @@ def misfit(frame: Any, about: dict[str, Any]) -> str:
     return ""
 
 
-def run_list(job: dict[str, Any], parent: Parent) -> None:
+def run_list(parent: Parent) -> None:
     """Say which sensors are there."""
-    initialize(job)
     version = openni2.get_version()
     parent.send(
         "devices", devices=devices(), version=f"{version.major}.{version.minor}.{version.maintenance}.{version.build}"
@@ -351,7 +345,6 @@ def run_list(job: dict[str, Any], parent: Parent) -> None:
 
 def run_device(job: dict[str, Any], parent: Parent) -> None:
     """Deliver a live sensor's frames until told to stop."""
-    initialize(job)
     slots = Slots(job, parent)
     live = LiveStream(job, parent)
     live.start()
@@ -372,12 +365,12 @@ def run_device(job: dict[str, Any], parent: Parent) -> None:
         now = time.monotonic()
         if filled and stream is live.stream:
             last_depth = now
-        elif not filled or now - last_depth > WAIT_S:
-            parent.send("idle", silent_s=now - last_depth)
-        if filled and stream is live.stream:
             deliver(frame, depth, slots, parent, "frame", "misfit")
-        elif filled:
-            deliver(frame, colour, slots, parent, "colour", "odd_colour")
+        else:
+            if not filled or now - last_depth > WAIT_S:
+                parent.send("idle", silent_s=now - last_depth)
+            if filled:
+                deliver(frame, colour, slots, parent, "colour", "odd_colour")
         if frame is not None:
             frame.close()
     live.close()
@@ -396,9 +389,6 @@ def deliver(frame: Any, about: Any, slots: Slots, parent: Parent, what: str, wro
         parent.send(what, slot=slot, index=frame.frameIndex, timestamp_us=frame.timestamp)
 
 
-JOBS = {"list": run_list, "device": run_device}
-
-
 def main() -> None:
     """Do the one job that the parent asks for, then leave without a farewell."""
     # Ctrl-C reaches every process of a terminal; the parent decides what it means.
@@ -407,7 +397,11 @@ def main() -> None:
     parent = Parent()
     job = parent.first_job()
     try:
-        JOBS[job["job"]](job, parent)
+        initialize(job)
+        if job["job"] == "list":
+            run_list(parent)
+        else:
+            run_device(job, parent)
     except JobError as error:
         parent.send("error", error=error.kind, message=str(error), remedy=error.remedy)
     except Exception as error:  # noqa: BLE001 - the parent turns it into a named error
