@@ -37,7 +37,7 @@ class PlayedSource(DepthSource):
         self.uri, self.camera, self.fps, self.about = source.uri, source.camera, source.fps / every, source.about
         self.state = "replay"
         if again is None and source.frame_count is not None:
-            self.frame_count = max(0, -(-(source.frame_count - start) // every))
+            self.frame_count = len(range(start, source.frame_count, every))
         self._index = self._time_us = 0  # by how much those of this time round are later
         self._last: DepthFrame | None = None
         self._frames_round = 0

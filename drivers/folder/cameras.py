@@ -91,8 +91,7 @@ def find_camera_file(root: Path) -> CameraFile:
             return _from_info(path, text)
         numbers = [float(word) for word in text.replace(",", " ").split()]
         if len(numbers) == 6:  # ARKitScenes
-            size = (int(numbers[0]), int(numbers[1]))
-            return CameraFile(path, tuple(numbers[2:]), size)  # type: ignore[arg-type]
+            return CameraFile(path, _matrix(numbers[2:]), (int(numbers[0]), int(numbers[1])))
         return CameraFile(path, _matrix(numbers))
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         advice = "put the camera and the scale into frames.toml, and rename or remove this file"

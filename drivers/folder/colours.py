@@ -51,7 +51,6 @@ class Colours:
         self._images = _paired(found, timestamps_us, sidecar.colour_timestamps_us) if colouring.wanted else []
         files = [image[1] for image in self._images if image]
         if not files:
-            self._images = []
             return
         self.about = f"; colour of {len(files)} of {len(self._images)} frames from '{files[0].parent}'"
         if not (self._registered or self._colouring.registered or self._colouring.place_mm):

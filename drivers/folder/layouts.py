@@ -73,7 +73,7 @@ class Layout:
     stamp : tuple of (str, float)
         Regular expression of the time in a file's name, and its unit in microseconds.
     convert : callable, optional
-        Millimetres of values that have no scale.
+        Millimetres of values that have no scale; of such a row, `values_per_metre` is 1000.
     colour : str
         The colour images beside, as a pattern from the root; several with ``|`` between.
     registered : bool

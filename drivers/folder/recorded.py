@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -133,7 +132,7 @@ class RecordedFolder(DepthSource):
         ahead = self._ahead or self._reader.submit(self._load, self._next)
         try:
             frame = ahead.result(timeout_s)
-        except FutureTimeoutError:
+        except TimeoutError:
             self._ahead = ahead
             raise SourceTimeoutError(
                 f"'{self._files[self._next]}' was not read within {timeout_s:g} s; is its disk or network share there?"
@@ -153,15 +152,12 @@ class RecordedFolder(DepthSource):
         self._reader.shutdown(wait=False, cancel_futures=True)
 
     def _load(self, index: int) -> DepthFrame:
-        path = self._files[index]
         raw = self._raw(index)
-        if raw.shape != (self.camera.height, self.camera.width):
+        shape = self.camera.height, self.camera.width
+        if raw.shape != shape:
             # The header was right when the folder was opened: the file has changed since.
-            raise _size_error(path, raw.shape, self.camera)
-        if self._timestamps_us is None:
-            timestamp_us = round(index * 1e6 / self.fps)
-        else:
-            timestamp_us = self._timestamps_us[index]
+            raise _size_error(self._files[index], raw.shape, shape)
+        timestamp_us = self._timestamps_us[index] if self._timestamps_us else round(index * 1e6 / self.fps)
         depth_mm = handed_over(self._convert(raw))
         frame, trouble = self._colours.on(DepthFrame(depth_mm, index, timestamp_us, self.camera, self.uri))
         if trouble and not self._colour_trouble:  # said once
@@ -220,7 +216,7 @@ class RecordedFolder(DepthSource):
             scale = MILLIMETRES if seen.size and np.median(seen) > _FARTHEST_M else 1.0
             where = "told by their size"
         else:
-            scale, coding = (row.values_per_metre, None) if row.convert is None else (MILLIMETRES, row.convert)
+            scale, coding = row.values_per_metre, row.convert
             where = "assumed" if row.assumed else f"the {row.name} layout's"
         if floating:
             names = {1.0: "metres", MILLIMETRES: "millimetres"}
@@ -272,12 +268,12 @@ def _shape_of(files: list[Path], stated: Camera | None) -> tuple[int, int]:
         if path.suffix.lower() == ".png" or path is files[0]:
             shape = read_size(path)
             if shape != first:
-                raise _size_error(path, shape, Camera.kinect(first[1], first[0]))
+                raise _size_error(path, shape, first)
     return first
 
 
-def _size_error(path: Path, shape: tuple[int, ...], camera: Camera) -> DamagedRecordingError:
-    what = f"is {shape[1]}x{shape[0]} pixels, but this recording is {camera.width}x{camera.height}"
+def _size_error(path: Path, shape: tuple[int, ...], others: tuple[int, int]) -> DamagedRecordingError:
+    what = f"is {shape[1]}x{shape[0]} pixels, but this recording is {others[1]}x{others[0]}"
     return damaged(path, what, f"keep frames of one size in a folder, and correct {SIDECAR} if it has one")
 
 
