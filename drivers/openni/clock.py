@@ -27,8 +27,7 @@ class Count:
         """Number and timestamp of a frame in the life of this source."""
         index, timestamp_us = int(message["index"]), int(message["timestamp_us"])
         now = time.monotonic()
-        renumbered = self._fresh or index + self._add_number <= self._number
-        if renumbered:
+        if self._fresh or index + self._add_number <= self._number:
             self._add_number = self._number + 1 - index
         # The outage takes as long on our clock as it took on the wall.
         away_us = max(round((now - self._seen_s) * 1e6), 1)

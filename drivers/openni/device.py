@@ -41,7 +41,6 @@ _NO_FRAMES = (
 )
 _GRACE_S = 1.0  # for a worker to stop the sensor before it is killed
 _PAIR_S = 0.01  # how soon a frame that waits for its colour is handed on without
-_FIELD_OF_VIEW = ("width", "height", "fov_x_rad", "fov_y_rad")
 _BEAT_S = 0.1  # how soon the supervisor notices that it should end
 
 
@@ -170,7 +169,7 @@ class OpenNIDevice(DepthSource):
         self._count = Count()
         self._attempts = 0
         started = time.monotonic()
-        self._worker, about = self._open(_OPEN_S, None)
+        about = self._open(_OPEN_S, None)
         self._reopen_s = max(_REOPEN_S, 2 * (time.monotonic() - started))
         camera, notes = camera_of(about, self.settings.intrinsics)
         if self.settings.mirror:
@@ -178,11 +177,10 @@ class OpenNIDevice(DepthSource):
         self.camera = camera
         self.fps = float(about["fps"])
         self._tenths = about["form"] == "0.1 mm"
-        self._colour: Message | None = about["colour"]
         colouring = self.settings.colouring
         if self._colour is not None:
             with suppress(ValueError):
-                seen = Camera.from_fov(*(self._colour[key] for key in _FIELD_OF_VIEW))
+                seen = Camera.from_fov(*(self._colour[key] for key in ("width", "height", "fov_x_rad", "fov_y_rad")))
                 colouring = colouring.told_by(seen.intrinsics)
         self._pairing = Pairing(self._colour is not None, bool(about["registered"]), colouring)
         wanted = (self.settings.width, self.settings.height, self.settings.fps)
@@ -192,7 +190,6 @@ class OpenNIDevice(DepthSource):
             notes += (text.format(*wanted, *taken),)
         for note in (*notes, about["colour_trouble"]):
             self._note_once(note)
-        self._doubt_identity(about)
         self._supervisor = threading.Thread(target=self._supervise, name="openni-supervisor", daemon=True)
         self._supervisor.start()
 
@@ -252,19 +249,12 @@ class OpenNIDevice(DepthSource):
         advice = " Check its cable and its power supply." if self.state == "stalled" else ""
         return SourceTimeoutError(f"The sensor {self.uri} gave no frame within {timeout_s:g} s.{advice}")
 
-    def _doubt_identity(self, about: Message) -> None:
-        if about["twins"] and not self.device.serial:
-            self._note_once(
-                "there are several of its kind and its driver gives no serial number; once one is"
-                " plugged in again, it cannot be known which it is"
-            )
-
     def _become(self, state: str, why: str = "") -> None:
         with self._changed:
             self.state, self.state_reason = state, why
 
-    def _open(self, timeout_s: float, known: DeviceInfo | None) -> tuple[Worker, Message]:
-        """Start a worker on the sensor and wait until it streams.
+    def _open(self, timeout_s: float, known: DeviceInfo | None) -> Message:
+        """Start a worker on the sensor and wait until it streams; what it then says of itself.
 
         A sensor that is known may have come back under another address.
         """
@@ -286,7 +276,14 @@ class OpenNIDevice(DepthSource):
                         self._become("reconnecting", "it is there again")
                 elif message["kind"] == "opened":
                     self.device = DeviceInfo(**message["device"])
-                    return worker, message
+                    self._worker = worker
+                    self._colour: Message | None = message["colour"]
+                    if message["twins"] and not self.device.serial:
+                        self._note_once(
+                            "there are several of its kind and its driver gives no serial number; once one is"
+                            " plugged in again, it cannot be known which it is"
+                        )
+                    return message
                 elif message["kind"] == "error":
                     raise error_of(message)
                 elif message["kind"] == "died":
@@ -397,8 +394,7 @@ class OpenNIDevice(DepthSource):
         while not self._closing.wait(_BACK_OFF_S[min(self._attempts, len(_BACK_OFF_S) - 1)]):
             self._attempts += 1
             try:
-                self._worker, about = self._open(self._reopen_s, self.device)
-                self._doubt_identity(about)
+                self._open(self._reopen_s, self.device)
             except SourceNotFoundError as error:
                 self._become("lost", str(error).rstrip("."))
             except SourceError as error:
@@ -406,6 +402,5 @@ class OpenNIDevice(DepthSource):
             else:
                 self.restarts += 1
                 self._count.restart()
-                self._colour = about["colour"]
                 self._pairing.restart()
                 return
