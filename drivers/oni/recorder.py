@@ -57,7 +57,6 @@ class OniRecorder:
         self._overwrite = overwrite
         check_place(self.path, overwrite)
         self._waiting: queue.Queue[DepthFrame | None] = queue.Queue(_WAITING)
-        self._closed = False
         self._thread = threading.Thread(target=self._run, name="oni-recorder", daemon=True)
         self._thread.start()
 
@@ -77,8 +76,7 @@ class OniRecorder:
             What is wrong with the recording, and what to do; empty if every frame that was handed
             over is in it, unchanged.
         """
-        if not self._closed:
-            self._closed = True
+        if self._thread.is_alive():
             self._waiting.put(None)
             self._thread.join()
         if not self.frames:
