@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from pathlib import Path
 
 from selective_depth.drivers.oni.codec import encode_depth
@@ -48,23 +49,19 @@ def repair_oni(path: str | Path, out_path: str | Path) -> OniReport:
     assert report.depth is not None and report.camera is not None
     defaults = depth_properties(report.camera, report.fps)
     kept = [node for node in report.nodes if not node.is_stream or (node.ready and node.codec in CODECS)]
-    with open_regular(report.path) as file:
-        writer = RecordWriter(Path(out_path))
-        try:
-            for node in kept:
-                properties, codec = node.properties, node.codec
-                if node is report.depth:  # it is written as it is delivered
-                    properties = {**defaults, **(properties if report.as_stored else {})}
-                    codec = CODEC_NONE if codec == CODEC_NONE else CODEC_TABLE
-                writer.add_node(OniNode(node.number, node.name, node.node_type, codec, properties))
-            writer.begin()
-            for node, frame in in_file_order(kept):
-                payload = read_payload(file, frame)
-                if node is report.depth:
-                    depth_mm = read_depth(report, file, frame)
-                    assert depth_mm is not None  # decoded a moment ago
-                    payload = encode_depth(depth_mm, writer.nodes[node.number].codec)
-                writer.add_frame(node.number, frame.timestamp_us, payload)
-        finally:
-            writer.close()
+    with open_regular(report.path) as file, closing(RecordWriter(Path(out_path))) as writer:
+        for node in kept:
+            properties, codec = node.properties, node.codec
+            if node is report.depth:  # it is written as it is delivered
+                properties = {**defaults, **(properties if report.as_stored else {})}
+                codec = CODEC_NONE if codec == CODEC_NONE else CODEC_TABLE
+            writer.add_node(OniNode(node.number, node.name, node.node_type, codec, properties))
+        writer.begin()
+        for node, frame in in_file_order(kept):
+            payload = read_payload(file, frame)
+            if node is report.depth:
+                depth_mm = read_depth(report, file, frame)
+                assert depth_mm is not None  # decoded a moment ago
+                payload = encode_depth(depth_mm, writer.nodes[node.number].codec)
+            writer.add_frame(node.number, frame.timestamp_us, payload)
     return inspect_oni(out_path, decode=True, timeout_s=math.inf)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass
 
 from selective_depth.drivers.errors import RuntimeMissingError
@@ -47,11 +48,8 @@ def list_devices() -> list[DeviceInfo]:
 
 def survey() -> tuple[list[DeviceInfo], str]:
     """As `list_devices`, with the version of the runtime; asked at once, none of them is opened."""
-    worker = Worker("list")
-    try:
+    with closing(Worker("list")) as worker:
         answer = worker.receive(_LIST_S)
-    finally:
-        worker.close()
     if answer is not None and answer["kind"] == "error":
         raise error_of(answer)
     if answer is None or answer["kind"] != "devices":
