@@ -20,13 +20,9 @@ TURNED_S = 2.0
 STOPPED_S = 0.9
 
 
-def _ball(b: Builder, x: float) -> None:
-    b.sphere(Material.RUBBER, (x, -120.0, 1600.0), BALL_MM)
-
-
 def ball(b: Builder, time_s: float) -> None:
     """A ball of 150 mm radius crosses from the left at 1.4 m/s, 1.6 m away."""
-    _ball(b, BALL_MM_S * time_s - OUTSIDE_MM)
+    b.sphere(Material.RUBBER, (BALL_MM_S * time_s - OUTSIDE_MM, -120.0, 1600.0), BALL_MM)
 
 
 def second_ball(b: Builder, time_s: float) -> None:
@@ -36,7 +32,7 @@ def second_ball(b: Builder, time_s: float) -> None:
 
 def stopping_ball(b: Builder, time_s: float) -> None:
     """The same ball stops in mid-view after 0.9 s."""
-    _ball(b, BALL_MM_S * min(time_s, STOPPED_S) - OUTSIDE_MM)
+    ball(b, min(time_s, STOPPED_S))
 
 
 def person(b: Builder, time_s: float) -> None:

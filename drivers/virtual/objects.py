@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -166,11 +167,9 @@ def render(
 
 def cut_to_object(depth_mm: DepthArray, camera: Camera) -> tuple[DepthArray, Camera]:
     """Smallest part of a frame that holds all its depth, and the camera of that part."""
-    rows, columns = np.flatnonzero(depth_mm.any(axis=1)), np.flatnonzero(depth_mm.any(axis=0))
-    top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
-    part = np.ascontiguousarray(depth_mm[top:bottom, left:right])
-    height, width = part.shape
-    return part, Camera(width, height, camera.fx, camera.fy, camera.cx - int(left), camera.cy - int(top))
+    left, top, width, height = cv2.boundingRect((depth_mm > 0).astype(np.uint8))
+    part = np.ascontiguousarray(depth_mm[top : top + height, left : left + width])
+    return part, Camera(width, height, camera.fx, camera.fy, camera.cx - left, camera.cy - top)
 
 
 def _splat_for(u: npt.NDArray[np.float64], v: npt.NDArray[np.float64]) -> int:
