@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from contextlib import suppress
 from typing import BinaryIO, Final
 
@@ -21,7 +21,7 @@ class OniColour:
 
     Parameters
     ----------
-    nodes : iterable of OniNode
+    nodes : collection of OniNode
         The recording's streams; the first colour stream that has frames is taken.
 
     Attributes
@@ -36,16 +36,15 @@ class OniColour:
         Why there is a colour stream that is not read; empty if there is none.
     """
 
-    def __init__(self, nodes: Iterable[OniNode]) -> None:
+    def __init__(self, nodes: Collection[OniNode]) -> None:
         self.node: OniNode | None = None
         self.camera: Camera | None = None
-        self.registered = False
+        depths = [node for node in nodes if node.node_type == NodeType.DEPTH]
+        self.registered = any(node.number_of(REGISTERED) == 1 for node in depths)
         self.unsupported = ""
         self._kind, self._size = "", (0, 0)
         for node in nodes:
-            if node.node_type == NodeType.DEPTH:
-                self.registered = self.registered or node.number_of(REGISTERED) == 1
-            if node.node_type != NodeType.IMAGE or not node.frames or self.node is not None:
+            if node.node_type != NodeType.IMAGE or not node.frames:
                 continue
             mode = node.values_of("xnMapOutputMode", "<III") or (0, 0, 0)
             kind = "JPEG" if node.codec == b"JPEG" else _KINDS.get(node.number_of("oniPixelFormat") or 200, "")
@@ -56,6 +55,7 @@ class OniColour:
             self.node, self._kind, self._size = node, kind, (int(mode[0]), int(mode[1]))
             with suppress(ValueError, ArithmeticError):
                 self.camera = node.camera(*self._size)
+            break
         self._times_us = [frame.timestamp_us for frame in self.node.frames] if self.node else []
 
     def image(self, payload: bytes, frame: OniFrame) -> ColourArray | None:
