@@ -94,6 +94,11 @@ class DepthSource(ABC):
             As their names say; frames already delivered stay good.
         """
 
+    def read_as(self, what: str, values: str, camera_from: str, colour: str) -> str:
+        """The `about` of a recording: what it is, what its values mean, where its camera and its colour come from."""
+        lens = "fx {:g} fy {:g} cx {:g} cy {:g}".format(*self.camera.intrinsics)
+        return f"'{self.uri}' is read as {what}: {values}; camera {lens} ({camera_from}){colour}."
+
     def skip(self, frames: int) -> None:
         """Leave out the next frames of a recording; raises as `read` does.
 

@@ -100,12 +100,8 @@ class BagReader(DepthSource):
         self.fps = rate if 0.01 < rate < 1000 else 30.0
         where = "as given" if values_per_metre else "as the bag says" if unit else "as ROS has it"
         what = "metres" if metres and self._scale == 1 else f"{self._scale:g} values a metre"
-        camera = self.camera
         colour = f"; colour from {self._colour_topic}" if self._colour_topic else ""
-        self.about = (
-            f"'{self.uri}' is read as a ROS bag, topic {topic}: {what} ({where}); camera fx"
-            f" {camera.fx:g} fy {camera.fy:g} cx {camera.cx:g} cy {camera.cy:g} ({camera_from}){colour}."
-        )
+        self.about = self.read_as(f"a ROS bag, topic {topic}", f"{what} ({where})", camera_from, colour)
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         """Return the next frame; see `DepthSource.read`."""

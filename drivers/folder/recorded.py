@@ -112,10 +112,7 @@ class RecordedFolder(DepthSource):
         self._convert, scale = self._conversion(said, where, marks)
         self._colours = Colours(self.found, sidecar, colouring, self._timestamps_us)
         self.notes += tuple(f"'{self.uri}': {note}" for note in self._colours.notes)
-        self.about = (
-            f"'{self.uri}' is read as {self.layout}: {scale}; camera fx {self.camera.fx:g} fy"
-            f" {self.camera.fy:g} cx {self.camera.cx:g} cy {self.camera.cy:g} ({camera_from}){self._colours.about}."
-        )
+        self.about = self.read_as(self.layout, scale, camera_from, self._colours.about)
         self._colour_trouble = False
         self._next = 0
         self._ahead: Future[DepthFrame] | None = None
