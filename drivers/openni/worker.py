@@ -206,7 +206,6 @@ class LiveStream:
         self.twins = len({address.partition("?")[0] for address in same}) > 1
         self.colour: Any = None
         self.colour_trouble = ""
-        self.registered = False
         if not self.device.has_sensor(openni2.SENSOR_DEPTH):
             raise JobError(f"{self.sensor} has no depth camera.")
         with refusing(f"{self.sensor} refuses a depth stream", " Pull it out and plug it in again."):
