@@ -50,14 +50,11 @@ def _own_folder() -> Path:
     """A folder in which nobody else can have put anything: what is in there is run."""
     if os.name == "posix":
         folder = Path(tempfile.gettempdir(), f"selective-depth-{os.getuid()}")
-        try:
+        with suppress(OSError):
             folder.mkdir(mode=0o700, exist_ok=True)
             about = folder.lstat()
-            ours = stat.S_ISDIR(about.st_mode) and about.st_uid == os.getuid()
-        except OSError:
-            ours = False
-        if ours and not about.st_mode & 0o077:
-            return folder
+            if stat.S_ISDIR(about.st_mode) and about.st_uid == os.getuid() and not about.st_mode & 0o077:
+                return folder
     return Path(tempfile.mkdtemp(prefix="selective-depth-"))
 
 

@@ -125,9 +125,8 @@ def place(mesh: Mesh, side: str, camera: Camera) -> tuple[npt.NDArray[np.float64
     extent = float((high - low).max())
     # Centred before it is scaled: a file far from its own origin must not lose its digits.
     points = (points - (low + high) / 2) * (OBJECT_MM / extent if extent > _SMALLEST else 1.0)
-    half_x = (1 - 2 * _MARGIN) * camera.width / (2 * camera.fx)
-    half_y = (1 - 2 * _MARGIN) * camera.height / (2 * camera.fy)
-    reach = np.maximum(np.abs(points[:, 0]) / half_x, np.abs(points[:, 1]) / half_y)
+    half = (1 - 2 * _MARGIN) / 2 * np.array((camera.width / camera.fx, camera.height / camera.fy))
+    reach = (np.abs(points[:, :2]) / half).max(axis=1)
     distance = max(float((reach - points[:, 2]).max()), _NEAREST_MM - float(points[:, 2].min()))
     points[:, 2] += distance
     return points, mesh.triangles
