@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Final, Self
 
 from selective_depth.drivers.errors import SourceEndedError, SourceError
@@ -112,12 +113,9 @@ class DepthSource(ABC):
         """Release the source. Harmless when called twice."""
 
     def __iter__(self) -> Iterator[DepthFrame]:
-        while True:
-            try:
-                frame = self.read()
-            except SourceEndedError:
-                return
-            yield frame
+        with suppress(SourceEndedError):
+            while True:
+                yield self.read()
 
     def __enter__(self) -> Self:
         return self
