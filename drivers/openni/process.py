@@ -73,7 +73,7 @@ class Worker:
     job : str
         ``"list"`` or ``"device"``.
     **values
-        The job's own parameters, as `openni_worker` reads them.
+        The job's own parameters, as `worker` reads them.
 
     Raises
     ------
@@ -93,7 +93,9 @@ class Worker:
                 stdout=subprocess.PIPE,
                 stderr=None if noisy else subprocess.DEVNULL,
                 pass_fds=descriptors,
-                **_own_group(),
+                # Ctrl-C in a terminal goes to a whole process group; the worker must not see it.
+                process_group=0,  # which Windows steps over, as others do a flag of 0
+                creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
             )
         finally:
             for descriptor in descriptors:
@@ -163,13 +165,6 @@ def _death(code: int) -> str:
         with contextlib.suppress(ValueError):
             return f"OpenNI2 crashed ({signal.Signals(-code).name})"
     return f"the OpenNI2 process ended with code {code}"
-
-
-def _own_group() -> dict[str, Any]:
-    # Ctrl-C in a terminal goes to a whole process group; the worker must not see it.
-    if sys.platform == "win32":
-        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
-    return {"process_group": 0}
 
 
 def _anonymous_memory(size: int) -> tuple[mmap.mmap, int | str, tuple[int, ...]]:
