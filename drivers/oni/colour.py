@@ -39,8 +39,7 @@ class OniColour:
     def __init__(self, nodes: Collection[OniNode]) -> None:
         self.node: OniNode | None = None
         self.camera: Camera | None = None
-        depths = [node for node in nodes if node.node_type == NodeType.DEPTH]
-        self.registered = any(node.number_of(REGISTERED) == 1 for node in depths)
+        self.registered = any(node.number_of(REGISTERED) == 1 for node in nodes if node.node_type == NodeType.DEPTH)
         self.unsupported = ""
         self._kind, self._size = "", (0, 0)
         for node in nodes:
