@@ -51,8 +51,7 @@ def _below(folder: Path, leave_out: Path | None) -> Iterator[Path]:
     folders = [Path(entry.path) for entry in entries if entry.is_dir() and entry.name[0] != "."]
     # A link that leads back up would never end.
     folders = [each for each in folders if not (each.is_symlink() and folder.resolve().is_relative_to(each.resolve()))]
-    nothing = not folders and not set(files) - {SIDECAR}
-    if nothing or "metadata.yaml" in files:
+    if "metadata.yaml" in files or not (folders or set(files) - {SIDECAR}):  # a bag, or nothing
         yield folder
         return
     yield from (folder / name for name in files if Path(name).suffix.lower() in FILES)

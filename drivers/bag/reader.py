@@ -180,8 +180,7 @@ class BagReader(DepthSource):
         found = [name for name in found if name.rpartition("/")[0] not in found]  # raw, if both
         if len(found) == 1:
             return found[0]
-        there = f"several: {', '.join(found)}" if found else f"none; images: {', '.join(images)}"
-        there = there.rstrip(": ")
+        there = f"several: {', '.join(found)}" if found else f"none; images: {', '.join(images)}".rstrip(": ")
         raise SourceNotFoundError(
             f"'{self.uri}' does not have exactly one depth topic but {there}; name one with --topic."
         )

@@ -91,10 +91,9 @@ class RecordedFolder(DepthSource):
             self.found = Found(ARRAYS, path.parent, [path] * len(self._stack))
             sidecar, beside = Sidecar(), CameraFile(path)
         self.layout = self.found.row.name
-        self._files = self.found.files
-        self.notes = doubtful_order(self._files)
-        self.frame_count = len(self._files)
-        shape = _shape_of(self._files, sidecar.camera) if self._stack is None else self._stack.shape[1:]
+        self.notes = doubtful_order(self.found.files)
+        self.frame_count = len(self.found.files)
+        shape = _shape_of(self.found.files, sidecar.camera) if self._stack is None else self._stack.shape[1:]
         self.camera, camera_from = self._camera(shape, intrinsics, sidecar.camera, beside)
         self._timestamps_us = sidecar.timestamps_us or self.found.timestamps_us
         for name, times in (("", self._timestamps_us), ("colour_", sidecar.colour_timestamps_us)):
@@ -132,16 +131,17 @@ class RecordedFolder(DepthSource):
         except TimeoutError:
             self._ahead = ahead
             raise SourceTimeoutError(
-                f"'{self._files[self._next]}' was not read within {timeout_s:g} s; is its disk or network share there?"
+                f"'{self.found.files[self._next]}' was not read within {timeout_s:g} s; is its disk or network"
+                " share there?"
             ) from None
         self._next += 1
-        more = self._next < len(self._files)
+        more = self._next < len(self.found.files)
         self._ahead = self._reader.submit(self._load, self._next) if more else None
         return frame
 
     def skip(self, frames: int) -> None:
         """Leave out frames without looking at them; before the first `read`."""
-        self._next = min(self._next + frames, len(self._files))
+        self._next = min(self._next + frames, len(self.found.files))
 
     def close(self) -> None:
         """Stop reading ahead."""
@@ -153,7 +153,7 @@ class RecordedFolder(DepthSource):
         shape = self.camera.height, self.camera.width
         if raw.shape != shape:
             # The header was right when the folder was opened: the file has changed since.
-            raise _size_error(self._files[index], raw.shape, shape)
+            raise _size_error(self.found.files[index], raw.shape, shape)
         timestamp_us = self._timestamps_us[index] if self._timestamps_us else round(index * 1e6 / self.fps)
         depth_mm = handed_over(self._convert(raw))
         frame, trouble = self._colours.on(DepthFrame(depth_mm, index, timestamp_us, self.camera, self.uri))
@@ -163,7 +163,7 @@ class RecordedFolder(DepthSource):
         return frame
 
     def _raw(self, index: int) -> npt.NDArray[Any]:
-        return read_raw(self._files[index]) if self._stack is None else self._stack[index]
+        return read_raw(self.found.files[index]) if self._stack is None else self._stack[index]
 
     def _camera(
         self, shape: tuple[int, ...], given: tuple[float, ...] | None, sidecar: Camera | None, beside: CameraFile
@@ -202,7 +202,7 @@ class RecordedFolder(DepthSource):
             If the scale is merely the usual one, and what it makes of the frames is impossible.
         """
         row = self.found.row
-        png = self._stack is None and self._files[0].suffix.lower() == ".png"
+        png = self._stack is None and self.found.files[0].suffix.lower() == ".png"
         kind = np.dtype(np.uint16) if png else self._raw(0).dtype
         floating = kind.kind == "f"
         seen = self._look() if said is None and (row.assumed or floating) else np.empty(0)
@@ -236,7 +236,7 @@ class RecordedFolder(DepthSource):
     def _look(self) -> npt.NDArray[Any]:
         """What some frames measured; those that are damaged say so when they are read."""
         seen = [np.empty(0)]
-        for index in range(0, len(self._files), len(self._files) // _LOOKS + 1):
+        for index in range(0, len(self.found.files), len(self.found.files) // _LOOKS + 1):
             with suppress(DamagedRecordingError):
                 raw = self._raw(index)
                 seen.append(raw[np.isfinite(raw) & (raw > 0)])
