@@ -32,7 +32,7 @@ class RealtimeSource(DepthSource):
         self.camera = source.camera
         self.fps = source.fps * speed
         self.frame_count = source.frame_count
-        self.notes = source.notes
+        self.about = source.about
         self.state = source.state
         self._changed = threading.Condition()
         self._newest: DepthFrame | None = None
@@ -42,6 +42,16 @@ class RealtimeSource(DepthSource):
         self._asked_again = threading.Event()
         self._thread = threading.Thread(target=self._play, name="realtime", daemon=True)
         self._thread.start()
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Those of the recording."""
+        return self._source.notes
+
+    @property
+    def damage(self) -> str:  # type: ignore[override]
+        """That of the recording."""
+        return self._source.damage
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         """Return the newest frame that has not been read; see `DepthSource.read`."""

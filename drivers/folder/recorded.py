@@ -140,7 +140,9 @@ class RecordedFolder(DepthSource):
         return frame
 
     def skip(self, frames: int) -> None:
-        """Leave out frames without looking at them; before the first `read`."""
+        """Leave out frames without looking at them."""
+        if frames:
+            self._ahead = None  # it is read, and nobody asks for it
         self._next = min(self._next + frames, len(self.found.files))
 
     def close(self) -> None:

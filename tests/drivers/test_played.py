@@ -11,9 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from selective_depth.drivers import open_source
+from selective_depth.drivers.bag import BagWriter
 from selective_depth.drivers.errors import SourceEndedError
 from selective_depth.drivers.folder import write_folder
 from selective_depth.drivers.frame import Camera, DepthFrame
+from selective_depth.drivers.oni import write_oni
 from selective_depth.drivers.played import PlayedSource
 from selective_depth.drivers.realtime import RealtimeSource
 from selective_depth.drivers.source import DepthSource
@@ -85,6 +87,34 @@ def test_a_real_recording_in_a_loop(tmp_path: Path) -> None:
     write_folder(tmp_path / "r", [Frames(5).read()])
     with PlayedSource(open_source(tmp_path / "r"), lambda: open_source(tmp_path / "r")) as played:
         assert [played.read().index for _ in range(3)] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("name", ["frames", "walk.oni", "walk.mcap", "virtual:ball?size=64x48&frames=9"])
+def test_every_third_frame_of_each_kind_of_recording(name: str, tmp_path: Path) -> None:
+    given = [DepthFrame(np.full((48, 64), 900 + k, np.uint16), k, 33_333 * k, Camera.kinect(64, 48)) for k in range(9)]
+    if name == "frames":
+        write_folder(tmp_path / name, given)
+    elif name.endswith(".oni"):
+        write_oni(tmp_path / name, given)
+    elif name.endswith(".mcap"):
+        BagWriter(tmp_path / name).write_all(given)
+    uri = name if name.startswith("virtual:") else str(tmp_path / name)
+    with open_source(uri) as source:
+        whole = list(source)
+    with PlayedSource(open_source(uri), start=1, every=3) as played:
+        found = list(played)
+    assert [frame.index for frame in found] == [1, 4, 7]
+    for frame in found:
+        np.testing.assert_array_equal(frame.depth_mm, whole[frame.index].depth_mm)
+
+
+def test_what_a_recording_says_of_itself_is_heard_in_real_time_too() -> None:
+    frames = Frames(3)
+    frames.about = "a recording, read as one"
+    with RealtimeSource(frames) as source:
+        frames.notes, frames.damage = ("turned round in frame 2",), "cut short"
+        assert source.about == frames.about
+        assert source.notes == frames.notes and source.damage == frames.damage
 
 
 @pytest.mark.parametrize(("speed", "seconds"), [(2.0, 0.2), (0.5, 0.8)])
