@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from selective_depth.drivers.frame import Camera, DepthFrame
 from selective_depth.selectors.arrays import Bools, Floats, Ints, measured_mm, warn_of_metres
+from selective_depth.selectors.nearby import nearest_points
 
 Measure = Callable[[Ints], npt.ArrayLike]
 """A random-access depth sensor: pixels (n, 2), column first, to depth (n,) in mm, 0 = none."""
@@ -217,8 +217,7 @@ class SeedGrid:
             )
         # Rays of the nearest seeds in the image, the nearer the heavier; at a seed its own.
         rays = self.points_mm / self.depth_mm[self.valid][:, None]
-        near = min(4, len(rays))
-        distance, index = cKDTree(self.uv).query(uv, k=[*range(1, near + 1)])
+        distance, index = nearest_points(self.uv, uv, 4)
         weight = 1 / (distance**2 + 1e-9)
         weight /= weight.sum(axis=-1, keepdims=True)
         ray = (rays[index] * weight[..., None]).sum(axis=-2)

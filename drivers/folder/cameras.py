@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.io import loadmat
 
 from selective_depth.drivers.folder.images import damaged
 from selective_depth.drivers.folder.sidecar import read_text
@@ -81,6 +80,8 @@ def find_camera_file(root: Path) -> CameraFile:
         return CameraFile(root)
     try:
         if path.suffix == ".mat":
+            from scipy.io import loadmat  # a tenth of a second, for one kind of folder
+
             entries = loadmat(path)
             scale = float(entries["factor_depth"].item())
             return CameraFile(path, _matrix(entries["intrinsic_matrix"].ravel()), None, scale)

@@ -7,11 +7,11 @@ seeds finds it, but every other sample in the middle of four does, for a small p
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from selective_depth.selectors.arrays import Ints, Longs
 from selective_depth.selectors.samples import seed_pitch_px
 from selective_depth.selectors.seeds import SeedGrid
+from selective_depth.selectors.triangulation import nearest_sample
 
 COARSE_PX = 6.0
 """Only a lattice of a wider pitch is refined.
@@ -79,8 +79,10 @@ def finer_lattice(seeds: SeedGrid, shots: int) -> tuple[Ints, float]:
     if not added or not len(seeds.uv):
         return np.empty((0, 2), np.int32), seed_pitch_px(seeds)
     uv = np.concatenate(added)
-    distance_px, _ = cKDTree(seeds.uv).query(uv)
-    return uv[distance_px <= reach_px].astype(np.int32), pitch_px
+    returned = np.zeros((height, width), np.bool_)
+    returned[seeds.uv[:, 1], seeds.uv[:, 0]] = True
+    _, gap_sq = nearest_sample(returned)
+    return uv[gap_sq[uv[:, 1], uv[:, 0]] <= reach_px**2].astype(np.int32), pitch_px
 
 
 def _middles(at: Longs, pixels: int) -> Longs:

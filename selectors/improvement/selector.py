@@ -12,8 +12,8 @@ import threading
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from selective_depth.selectors.arrays import Bools, Floats, Ints
 from selective_depth.selectors.choice import choose
@@ -193,11 +193,11 @@ class ImprovementPlan:
         if added:
             windows = windows_of(samples.seeds, rule.exponent)
             new = np.concatenate(added)
-            changed = np.zeros(samples.frame_shape, np.bool_)
-            changed[new[:, 1], new[:, 0]] = True
+            measured = np.zeros(samples.frame_shape, np.uint8)
+            measured[new[:, 1], new[:, 0]] = 1
             # From one end of a window, rim included, to the pixel before the other.
             sides = [4 * axis.longest - 1 for axis in (windows.rows, windows.columns)]
-            changed = maximum_filter(changed, sides)
+            changed = cv2.dilate(measured, np.ones(sides, np.uint8)).view(np.bool_)
             self._raw[changed] = rule._map(samples, changed).raw[changed]
             self._seen = samples.additions
         return choose(np.where(samples.open(), self._raw, 0), shots)

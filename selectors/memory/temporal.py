@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass, field, replace
 
+import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import maximum_filter
 
 from selective_depth.drivers.frame import Camera
 from selective_depth.selectors.acquire import acquire, shots_of
@@ -29,7 +29,7 @@ from selective_depth.selectors.memory.change import (
     drift,
 )
 from selective_depth.selectors.memory.store import Memory, book, forget, forget_all
-from selective_depth.selectors.memory.worth import WRONG, Noise, shot_worth
+from selective_depth.selectors.memory.worth import Noise, shot_worth, wrong
 from selective_depth.selectors.parallel import in_bands
 from selective_depth.selectors.samples import REACH, Samples, seed_pitch_px
 from selective_depth.selectors.seeds import Measure, SeedGrid, answers
@@ -206,6 +206,7 @@ class TemporalAcquisition:
         self._memory = Memory.of(self.shape)
         self._surface = Surface(self.shape, self.threads)
         self._worth = np.empty(self.shape, np.float32)
+        self._wrong = wrong()
         self._by = ""
 
     def step(self, measure: Measure) -> TemporalStep:
@@ -297,7 +298,7 @@ class TemporalAcquisition:
             new = sensor.unasked(best_pixels(border_px, shots))
             extent.add(new, contradicts(new, sensor(new), model_mm))
         where, _ = extent.changed()
-        return np.asarray(maximum_filter(where, 2 * MARGIN_PX + 1))
+        return cv2.dilate(where.view(np.uint8), np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)).view(np.bool_)
 
     def _start(self, sensor: _Sensor, restarted: bool) -> Floats:
         """Acquire the frame as if it were the first, and return the model of it alone."""
@@ -330,7 +331,7 @@ class TemporalAcquisition:
         worth, layers, noise = self._worth, self._surface.layers, (self.noise.floor_mm, self.noise.per_mm)
         tiles = np.flatnonzero(layers.touched)
         layers.touched[:] = False
-        what = tiles, self._memory, layers, self._reach_sq, noise, self._frame, WRONG, worth
+        what = tiles, self._memory, layers, self._reach_sq, noise, self._frame, self._wrong, worth
         in_bands(shot_worth, len(tiles), self.threads, *what)
         first = len(sensor.uv)
         if self.selector is not None:

@@ -10,9 +10,9 @@ it. A new pixel's error is the range of the model about it, where a discontinuit
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from scipy.special import betainc
 
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Floats, Longs
@@ -48,14 +48,14 @@ class Noise:
     per_mm: float = 1.4e-6
 
 
-def _wrong() -> Floats:
+@cache
+def wrong() -> Floats:
     """Chance that the minority of k of n observations is right, shape (KEPT + 1, KEPT + 1)."""
+    from scipy.special import betainc  # a fifth of a second to import, where nothing is remembered for nothing
+
     n, k = np.meshgrid(np.arange(KEPT + 1), np.arange(KEPT + 1), indexing="ij")
     k = np.minimum(k, n)
     return np.asarray(1 - betainc(k + PRIOR, n - k + PRIOR, 0.5), np.float32)
-
-
-WRONG = _wrong()
 
 
 @njit(cache=True, nogil=True)
@@ -91,7 +91,7 @@ def shot_worth(
     now : int
         The frame; what was measured in it is not measured again.
     wrong : float32 array
-        `WRONG`.
+        What the function of that name gives.
     worth : float32 array of shape (H, W)
         Filled in.
     """

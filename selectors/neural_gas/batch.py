@@ -6,10 +6,10 @@ import math
 from typing import Self
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from selective_depth.drivers.kernels import njit
 from selective_depth.selectors.arrays import Bools, Floats, Ints
+from selective_depth.selectors.nearby import nearest_points
 from selective_depth.selectors.neural_gas.exact import draw_nodes
 from selective_depth.selectors.parallel import in_bands
 
@@ -113,7 +113,7 @@ class BatchNeuralGas:
         """
         self.nodes_mm_, self.nodes_uv_ = nodes_mm, nodes_uv.copy()
         self.won_ = np.ones(len(nodes_mm), dtype=np.bool_)
-        distance, _ = cKDTree(nodes_mm).query(points_mm)
+        distance, _ = nearest_points(nodes_mm, points_mm)
         self.quantisation_error_mm_ = float(distance.mean())
         self.reheated_ = False
         return self

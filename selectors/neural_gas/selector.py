@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from selective_depth.selectors.arrays import Doubles, Floats
+from selective_depth.selectors.nearby import nearest_points
 from selective_depth.selectors.neural_gas.batch import BatchNeuralGas
 from selective_depth.selectors.neural_gas.exact import train_exact
 from selective_depth.selectors.neural_gas.regions import EdgeMetric, RegionSelection, check_edges, delaunay_regions
@@ -187,9 +187,7 @@ def node_pixels(nodes_mm: Floats, samples: SeedGrid | Samples) -> Floats:
     """
     if samples.camera is not None:
         return samples.camera.project_uv(nodes_mm)
-    points_mm = samples.points_mm
-    near = min(4, len(points_mm))
-    distance, index = cKDTree(points_mm).query(nodes_mm, k=[*range(1, near + 1)])
+    distance, index = nearest_points(samples.points_mm, nodes_mm, 4)
     uv = samples.uv[index]
     weight = 1 / (distance + 1e-3)
     # Neighbours in space may lie at both ends of a panorama's rows: no mean over the seam.

@@ -14,7 +14,7 @@ from code_size import code_lines
 ROOT = Path(__file__).parents[2]
 HOUSES = ("app", "drivers", "selectors")
 FILES = sorted(path for house in HOUSES for path in (ROOT / house).rglob("*.py"))
-MOST_CODE = 16_330
+MOST_CODE = 16_350
 MOST_LINES = 450
 MOST_FILES = 14
 # Lines and parameters of a function; of a compiled one, whose helpers cost inlining.

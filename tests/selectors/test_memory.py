@@ -16,7 +16,7 @@ from selective_depth.selectors.memory import TemporalAcquisition
 from selective_depth.selectors.memory.change import Extent, around, contradicts, drift
 from selective_depth.selectors.memory.store import AGREE_MM, AGREE_SHARE, KEPT, Memory, book, forget
 from selective_depth.selectors.memory.temporal import PROBATION
-from selective_depth.selectors.memory.worth import WRONG, shot_worth
+from selective_depth.selectors.memory.worth import shot_worth, wrong
 from selective_depth.selectors.neural_gas import LongEdgeSelector, NeuralGasSelector
 from selective_depth.selectors.quality import errors_of
 from selective_depth.selectors.seeds import SeedGrid
@@ -90,17 +90,17 @@ def test_a_pixel_that_returns_no_more_is_known_no_more() -> None:
 
 
 def test_the_chance_of_a_wrong_majority_falls_with_agreement() -> None:
-    assert WRONG[0, 0] == pytest.approx(0.5)
-    assert (np.diff(WRONG[1:, 0]) < 0).all()
-    assert WRONG[10, 5] == pytest.approx(0.5)
-    assert WRONG[10, 1] < WRONG[10, 3] < WRONG[10, 5]
+    assert wrong()[0, 0] == pytest.approx(0.5)
+    assert (np.diff(wrong()[1:, 0]) < 0).all()
+    assert wrong()[10, 5] == pytest.approx(0.5)
+    assert wrong()[10, 1] < wrong()[10, 3] < wrong()[10, 5]
 
 
 def worth_of(memory: Memory, model_mm: np.ndarray, now: int = 9) -> np.ndarray:
     layers = Surface(model_mm.shape).layers._replace(depth_mm=model_mm, gap_sq=np.zeros(model_mm.shape, np.int32))
     worth = np.empty(model_mm.shape, np.float32)
     tiles = np.arange(layers.touched.size)
-    shot_worth(0, len(tiles), tiles, memory, layers, 40.0, (1.0, 1.4e-6), now, WRONG, worth)
+    shot_worth(0, len(tiles), tiles, memory, layers, 40.0, (1.0, 1.4e-6), now, wrong(), worth)
     return worth
 
 
