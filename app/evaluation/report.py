@@ -81,7 +81,9 @@ def run_evaluation(
     check_output(files.json, files.page)
     check_picture(files.table, TABLES, "table")
     if options.over_time:
-        return _run_over_time(sources, options, settings, files)
+        if files.table or files.page or files.curves:
+            raise UsageError("--over-time writes --json and --picture alone; leave --table, --page and --curves out.")
+        return _run_over_time(sources, options, settings, files, page)
     with FrameProgress("Evaluating", None) as bar:
         found = outcomes(sources, options, settings, lambda done, total: bar.update(done, f"of {total}"))
     print_results(summarise(found), len({outcome.frame for outcome in found}), options.rounds)
@@ -241,7 +243,7 @@ def comparison(case: Case, width_in: float = WIDTH_IN) -> Figure:
 
 
 def _run_over_time(
-    sources: Sequence[str], options: ComparisonOptions, settings: Settings, files: EvaluationFiles
+    sources: Sequence[str], options: ComparisonOptions, settings: Settings, files: EvaluationFiles, page: PictureOptions
 ) -> None:
     """Follow each source, print its errors, and write them as JSON if asked.
 
@@ -259,7 +261,7 @@ def _run_over_time(
         frame, step, found[uri] = followed
         _print_courses(uri, found[uri], budget)
         if files.picture is not None and len(found) == 1:
-            write_picture(files.picture, _memory_picture(frame, step))
+            write_picture(files.picture, _memory_picture(frame, step, page.width), page.dpi)
             say(f"wrote {files.picture}")
     document = {
         "over_time": {uri: {way: asdict(course) for way, course in ways.items()} for uri, ways in found.items()},
@@ -268,7 +270,7 @@ def _run_over_time(
     write_if_asked(files.json, lambda path: write_output(path, json.dumps(document, indent=1) + "\n"))
 
 
-def _memory_picture(frame: DepthFrame, step: TemporalStep) -> Figure:
+def _memory_picture(frame: DepthFrame, step: TemporalStep, width_in: float) -> Figure:
     """The truth, the sensor's whole frame and the memory's model, and how wrong both are."""
     exact = replace(frame, depth_mm=truth_of(frame))
     remembered = replace(frame, depth_mm=np.clip(np.rint(step.model_mm), 0, 65535).astype(np.uint16))
@@ -276,7 +278,8 @@ def _memory_picture(frame: DepthFrame, step: TemporalStep) -> Figure:
     seen = replace(exact, depth_mm=np.where(frame.depth_mm > 0, exact.depth_mm, 0).astype(np.uint16))
     errors = [error_panel(seen, shown.depth_mm.astype(np.float32), "Its error") for shown in (frame, remembered)]
     share = f"{100 * len(step.uv) / frame.depth_mm.size:.3g} % of the pixels a frame"
-    return sheet([(f"Frame {step.frame}: memory from {share}", first), ("", [None, *errors])], legend=False)
+    title = f"Frame {step.frame}: memory from {share}"
+    return sheet([(title, first), ("", [None, *errors])], width_in, legend=False)
 
 
 def _print_courses(uri: str, ways: dict[str, Course], budget: float) -> None:

@@ -442,6 +442,7 @@ def test_over_time_a_memory_is_held_against_what_it_replaces(
     out, picture = tmp_path / "out.json", tmp_path / "memory.png"
     uri = "virtual:ball?speed=0&frames=6&size=160x120"
     words = ["evaluate", uri, "--over-time", "--budget", "5%", "--json", str(out), "--picture", str(picture)]
+    words += ["--width", "6", "--dpi", "50"]
     assert run([*words, "--seeds.rows", "32", "--seeds.columns", "32", "--rounds", "4"]) == OK
     found = json.loads(out.read_text())["over_time"][uri]
     assert set(found) == {"memory", "memoryless", "whole_frame", "median"}
@@ -450,9 +451,10 @@ def test_over_time_a_memory_is_held_against_what_it_replaces(
     assert found["memory"]["rmse_mm"][0] == pytest.approx(found["memoryless"]["rmse_mm"][0])
     assert found["memory"]["mae_mm"][-1] < 0.8 * found["memoryless"]["mae_mm"][-1]
     assert found["median"]["rmse_mm"][-1] < found["whole_frame"]["rmse_mm"][-1]
-    assert cv2.imread(str(picture)) is not None
+    assert cv2.imread(str(picture)).shape[1] == 6 * 50
     assert "memoryless" in capsys.readouterr().out
     assert run(["evaluate", "--over-time"]) == MISUSED
+    assert run(["evaluate", uri, "--over-time", "--budget", "5%", "--curves", "x.pdf"]) == MISUSED
 
 
 def test_over_time_a_recording_without_truth_is_held_against_itself(folder: Path) -> None:
