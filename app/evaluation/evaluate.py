@@ -17,7 +17,7 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExe
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice, product
+from itertools import islice
 
 import numpy as np
 
@@ -120,12 +120,14 @@ def _evaluate_frame(
 ) -> list[Outcome]:
     label = f"{frame.source} {frame.index}"
     outcomes = []
-    for budget, name in product(options.budget, names):
+    for budget in options.budget:
         shots = shots_of(float(budget), frame.shape)
         measured = (shots + settings.seeds.rows * settings.seeds.columns) / frame.depth_mm.size
-        draws = range(options.random_seeds if strategy_of(name).chance else 1)
-        errors = tuple(run_strategy(name, Case(frame, settings, shots, options.rounds, seed)) for seed in draws)
-        outcomes.append(Outcome(label, budget, name, errors, frame.source, frame.index, measured))
+        # One for all strategies: what several of them build on is made once.
+        cases = [Case(frame, settings, shots, options.rounds, seed) for seed in range(options.random_seeds)]
+        for name in names:
+            errors = tuple(run_strategy(name, case) for case in cases[: None if strategy_of(name).chance else 1])
+            outcomes.append(Outcome(label, budget, name, errors, frame.source, frame.index, measured))
     return outcomes
 
 
