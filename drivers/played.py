@@ -7,10 +7,10 @@ from dataclasses import replace
 
 from selective_depth.drivers.errors import SourceEndedError
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.source import DepthSource
+from selective_depth.drivers.source import DepthSource, RelayedSource
 
 
-class PlayedSource(DepthSource):
+class PlayedSource(RelayedSource):
     """Every n-th frame of a recording from one frame on; in a loop, its numbers and times go on.
 
     Parameters
@@ -34,7 +34,7 @@ class PlayedSource(DepthSource):
         self, source: DepthSource, again: Callable[[], DepthSource] | None = None, *, start: int = 0, every: int = 1
     ) -> None:
         self._source, self._again, self._start, self._every = source, again, start, every
-        self.uri, self.camera, self.fps, self.about = source.uri, source.camera, source.fps / every, source.about
+        self.uri, self.camera, self.fps = source.uri, source.camera, source.fps / every
         self.state = "replay"
         if again is None and source.frame_count is not None:
             self.frame_count = len(range(start, source.frame_count, every))
@@ -42,16 +42,6 @@ class PlayedSource(DepthSource):
         self._last: DepthFrame | None = None
         self._frames_round = 0
         self._skip(start)
-
-    @property
-    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Those of the recording."""
-        return self._source.notes
-
-    @property
-    def damage(self) -> str:  # type: ignore[override]
-        """That of the recording."""
-        return self._source.damage
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         """Return the next frame that is played; see `DepthSource.read`."""

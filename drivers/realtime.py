@@ -7,10 +7,10 @@ import time
 
 from selective_depth.drivers.errors import SourceEndedError, SourceTimeoutError
 from selective_depth.drivers.frame import DepthFrame
-from selective_depth.drivers.source import DepthSource
+from selective_depth.drivers.source import DepthSource, RelayedSource
 
 
-class RealtimeSource(DepthSource):
+class RealtimeSource(RelayedSource):
     """Paces another source by its timestamps; frames not read in time are lost and counted.
 
     The clock starts when the second frame is asked for: with the first, a reader gets ready.
@@ -32,7 +32,6 @@ class RealtimeSource(DepthSource):
         self.camera = source.camera
         self.fps = source.fps * speed
         self.frame_count = source.frame_count
-        self.about = source.about
         self.state = source.state
         self._changed = threading.Condition()
         self._newest: DepthFrame | None = None
@@ -42,16 +41,6 @@ class RealtimeSource(DepthSource):
         self._asked_again = threading.Event()
         self._thread = threading.Thread(target=self._play, name="realtime", daemon=True)
         self._thread.start()
-
-    @property
-    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Those of the recording."""
-        return self._source.notes
-
-    @property
-    def damage(self) -> str:  # type: ignore[override]
-        """That of the recording."""
-        return self._source.damage
 
     def read(self, timeout_s: float = 5.0) -> DepthFrame:
         """Return the newest frame that has not been read; see `DepthSource.read`."""

@@ -122,3 +122,24 @@ class DepthSource(ABC):
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         self.close()
+
+
+class RelayedSource(DepthSource):
+    """One that plays the frames of another, which it owns: what is said of that one is said of it."""
+
+    _source: DepthSource
+
+    @property
+    def about(self) -> str:  # type: ignore[override]
+        """What the other is read as."""
+        return self._source.about
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Those of the other, so far."""
+        return self._source.notes
+
+    @property
+    def damage(self) -> str:  # type: ignore[override]
+        """That of the other, so far."""
+        return self._source.damage

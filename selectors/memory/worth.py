@@ -51,7 +51,7 @@ class Noise:
 @cache
 def wrong() -> Floats:
     """Chance that the minority of k of n observations is right, shape (KEPT + 1, KEPT + 1)."""
-    from scipy.special import betainc  # a fifth of a second to import, where nothing is remembered for nothing
+    from scipy.special import betainc  # a fifth of a second to import, for who remembers alone
 
     n, k = np.meshgrid(np.arange(KEPT + 1), np.arange(KEPT + 1), indexing="ij")
     k = np.minimum(k, n)
